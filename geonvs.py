@@ -1,44 +1,46 @@
-"""Geo-NVS-w: a signed distance field, fed by tourist photos, becomes a picture from a new viewpoint.
+"""Geo-NVS-w: a signed distance field, fed by tourist photos, becomes a picture from a new view.
 
 A minimal single-file reference implementation of "Geo-NVS-w: Geometry-Aware Novel View Synthesis
-In-the-Wild with an SDF Renderer" (Tsalakopoulos et al., ICCV 2025 workshops). Read it top to bottom:
+In-the-Wild with an SDF Renderer" (Tsalakopoulos et al., ICCV 2025 workshops). Read it from the top:
 the sections follow one ray from the pixel to the loss, then the training loop around it.
 
-    python geonvs.py                             toy scene: made, trained, scored (minutes, 2 CPU cores)
-    python geonvs.py --scene brandenburg         a Phototourism scene (one GPU); also sacre, trevi, taj
-    python geonvs.py --data DIR                  your own COLMAP folder
-    python geonvs.py --help                      every setting with its meaning, unit and source
+    python geonvs.py                       toy scene: made, trained, scored (minutes, 2 CPU cores)
+    python geonvs.py --scene brandenburg   a Phototourism scene (one GPU); also sacre, trevi, taj
+    python geonvs.py --data DIR            your own COLMAP folder
+    python geonvs.py --help                every setting with its meaning, unit and source
 
 A run writes runs/<name>/: metrics.json, log.jsonl, checkpoint.pt, panel.png, mesh.ply.
 
 Conventions, stated once
   world     the foreground is the unit sphere; x_file = x * scale + center leads back to SfM units
-  cameras   c2w (3,4) camera to world, OpenCV axes: x right, y down, z forward; pixel centres at +0.5
+  cameras   c2w (3,4) camera to world, OpenCV axes: x right, y down, z forward; pixel centres +0.5
   rays      r(t) = o + t d with |d| = 1, so t is a distance along the ray and not a z-depth
   sdf       positive outside; the normal is the unit gradient; colours are sRGB in [0, 1]
   mask      M = 1 means transient (person, car), M = 0 means scene
-  shapes    R rays, S samples per ray, P points, L octree levels, C channels per level, V octree corners,
-            A appearance dims, I photos, K sparse points
+  shapes    R rays, S samples per ray, P points, L octree levels, C channels per level,
+            V octree corners, A appearance dims, I photos, K sparse points
 
 Where the printed paper is departed from, the line carries its tag:
-  [D1]  alpha is divided by sigmoid(zeta s_prev) and never negative (as printed, a wall is 63 % opaque)
+  [D1]  alpha is divided by sigmoid(zeta s_prev) and never negative (printed: a wall is 63 % opaque)
   [D2]  the slope correction sits inside zeta, with opposite signs for the two ends of a section
   [D3]  Phi uses NeuS-weighted errors, |lap| times eps, batch-quantile calibration, and is detached
   [D4]  the curvature loss is |lap| times eps: |lap| of a trilinear field grows as eps shrinks
-  [D5]  the Lipschitz term is a sum of logs, not a product that starts ten times above the colour loss
-  [D6]  CGNet: GroupNorm for BatchNorm, half the width, negative initial bias, a head at half resolution
-  [D7]  the mask pays mean M, not mean M^2, to go with an L1 error; its weight decays from a high start
+  [D5]  the Lipschitz term is a sum of logs, not a product that starts ten times above the colour
+  [D6]  CGNet: GroupNorm for BatchNorm, half the width, negative first bias, head at half resolution
+  [D7]  the mask pays mean M, not mean M^2, to go with an L1 error, above twice the median error
   [D8]  the background starts where the ray leaves the sphere and its last section is opaque
-  [D9]  the SDF branch stays in float32 under mixed precision: half precision turns normals into noise
+  [D9]  the SDF branch stays in float32 under mixed precision: half precision makes noise of normals
   [D10] SfM points place the sphere, seed the octree and pull |s(p)| to zero
   [D11] samples are drawn from a cached SDF volume; no second network pass along the ray
   [D12] test photos: appearance fitted on the left half, scored on the right half
   [D13] normals come from differentiating the trilinear weights; --normals fd is the paper's choice
+  [D14] the mask network learns every few steps from the remembered errors of whole photos
 """
 from __future__ import annotations
 
 import argparse
 import difflib
+import itertools
 import json
 import math
 import os
@@ -47,6 +49,7 @@ import subprocess
 import sys
 import threading
 import time
+import zlib
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import NamedTuple
@@ -62,22 +65,21 @@ from torch import Tensor, nn
 import data_prep
 from data_prep import UserError, atomic_write
 
-# ---------------------------------------------------------------------------------------------------
-# 1 Config: every field is a flag
-# ---------------------------------------------------------------------------------------------------
+
+# ---- 1 Config: every field is a flag -------------------------------------------------------------
 
 
-def opt(default, text, choices=None):
-    return field(default=default, metadata={"help": text, "choices": choices})
+def opt(default, text, *choices):
+    return field(default=default, metadata={"help": text, "choices": choices or None})
 
 
 @dataclass
 class Config:
-    """All settings. [R] marks a value that the paper leaves open (recommended by the predecessors)."""
+    """All settings. [R] marks a value that the paper leaves open (recommended by predecessors)."""
 
     scene: str = opt("toy", "toy, brandenburg, sacre, trevi or taj")
     data: str = opt("", "an IMC-PT or COLMAP folder instead of a named scene")
-    method: str = opt("geonvsw", "which model to train", ("geonvsw", "nerfw", "hanerf"))
+    method: str = opt("geonvsw", "which model to train", "geonvsw", "nerfw", "hanerf")
     name: str = opt("", "run folder below runs/ (default: scene-method-seed)")
     seed: int = opt(0, "seed of everything random")
     device: str = opt("auto", "auto, cpu, cuda or cuda:N")
@@ -87,21 +89,24 @@ class Config:
     rays: int = opt(512, "rays per step")
     photos: int = opt(8, "photos per step; the mask network sees these whole")
     samples: int = opt(16, "foreground samples per ray")
-    bg_samples: int = opt(8, "background samples per ray")
+    bg_samples: int = opt(16, "background samples per ray")
     levels: int = opt(0, "octree levels, 0: from the pixel footprint at the surface")
+    grid: str = opt("octree", "uniform: the same finest cell everywhere", "octree", "uniform")
+    split_error: float = opt(0.02, "mean L1 error of rays that splits the cell they end in [R]")
+    max_mb: float = opt(1000.0, "most memory that the foreground octree may take, MiB")
     bg_levels: int = opt(3, "octree levels of the background")
     channels: int = opt(4, "feature channels per octree level")
     hidden: int = opt(64, "width of the MLPs")
     appearance_dim: int = opt(16, "length of a photo's appearance code")
-    appearance: str = opt("auto", "appearance codes; auto: on if exposures differ", ("auto", "on", "off"))
-    mask: str = opt("auto", "transient mask; auto: off if nothing is transient", ("auto", "on", "off"))
-    background: str = opt("auto", "background field; auto: off if it is one colour", ("auto", "on", "off"))
-    mask_every: int = opt(4, "the mask network runs every so many steps; between, its last logits count")
+    appearance: str = opt("auto", "codes; auto: on if exposures differ", "auto", "on", "off")
+    mask: str = opt("auto", "mask; auto: off if nothing is transient", "auto", "on", "off")
+    background: str = opt("auto", "field; auto: off if it is one colour", "auto", "on", "off")
+    mask_every: int = opt(4, "steps from one run of the mask network to the next [D14]")
     mask_px: int = opt(96, "side of the square photo that the mask network sees, px")
-    normals: str = opt("analytic", "derivatives of the SDF [D13]", ("analytic", "fd"))
-    sampling: str = opt("cached", "how samples are placed [D11]", ("cached", "uniform"))
-    alpha: str = opt("neus", "opacity of a section [D1] [D2]", ("neus", "printed"))
-    gpl: str = opt("calibrated", "edge indicator Phi [D3]", ("calibrated", "literal"))
+    normals: str = opt("analytic", "derivatives of the SDF [D13]", "analytic", "fd")
+    sampling: str = opt("cached", "how samples are placed [D11]", "cached", "uniform")
+    alpha: str = opt("neus", "opacity of a section [D1] [D2]", "neus", "printed")
+    gpl: str = opt("calibrated", "edge indicator Phi [D3]", "calibrated", "literal")
     lam_eik: float = opt(0.04, "weight of the eikonal loss (Permuto-SDF)")
     lam_curv: float = opt(1e-3, "weight of the curvature loss, on |lap| eps [D4] [R]")
     lam_gpl: float = opt(0.05, "weight of the geometry-preservation loss (paper)")
@@ -110,28 +115,26 @@ class Config:
     lam_lps: float = opt(1e-5, "weight of the Lipschitz loss, log form [D5] [R]")
     lam_off: float = opt(1e-3, "weight of the off-surface loss [R]")
     lam_sfm: float = opt(0.3, "weight of |s(p)| at SfM points [D10]")
-    lam_mask: float = opt(0.1, "weight of mean M: the L1 error from which a pixel is masked [D7]")
-    lam_bimodal: float = opt(1e-4, "weight of the pull of M towards 0 and 1 (Ha-NeRF's digit loss) [R]")
+    lam_mask: float = opt(0.09, "weight of mean M: the excess L1 error that masks a pixel [D7]")
+    lam_bimodal: float = opt(1e-4, "weight of the pull of M to 0 and 1 (Ha-NeRF's digit loss) [R]")
     lr_grid: float = opt(1e-2, "learning rate of octree features")
     lr_net: float = opt(2e-3, "learning rate of networks and codes")
     lr_zeta: float = opt(1e-3, "learning rate of the deviation network")
+    curve: bool = opt(False, "record PSNR of held-out left halves over s and Wh, for --chart")
     amp: bool = opt(True, "mixed precision on a GPU [D9]")
-    protocol: str = opt("half", "half: fit left, score right [D12]; leaky: fit on all", ("half", "leaky"))
+    protocol: str = opt("half", "half: fit left, score right [D12]; leaky: all", "half", "leaky")
 
 
-SCENES = {  # settings that differ from Config's defaults, by scene; flags override them
-    "toy": dict(steps=5000),
-    **{name: dict(steps=300_000, rays=4096, photos=16, samples=32, bg_samples=16, appearance_dim=32)
-       for name in data_prep.SCENES},
-}
+LARGE = dict(steps=300_000, rays=4096, photos=16, samples=32, bg_samples=16, appearance_dim=32)
+# settings that differ from Config's defaults, by scene; flags override them
+SCENES = {"toy": dict(steps=3000), **{name: LARGE for name in data_prep.SCENES}}
 
-# ---------------------------------------------------------------------------------------------------
-# 2 Scene file and rays
-# ---------------------------------------------------------------------------------------------------
+
+# ---- 2 Scene file and rays -----------------------------------------------------------------------
 
 
 class Scene(NamedTuple):
-    """The arrays of one scene file (data_prep.py documents them) as tensors on the device."""
+    """The arrays of a scene file (data_prep.py documents them) as tensors on the device."""
 
     rgb: Tensor  # (N,3) uint8, all pixels of all photos, photo after photo
     start: Tensor  # (I+1,) first pixel of each photo
@@ -141,37 +144,29 @@ class Scene(NamedTuple):
     near: Tensor  # (I,) smallest useful t
     is_test: Tensor  # (I,)
     points: Tensor  # (K,3) SfM points
-    track_photo: Tensor  # (T,) photo ...
-    track_point: Tensor  # (T,) ... in which this point was found
     thumbs: Tensor  # (I,3,mask_px,mask_px) uint8, whole photos for the mask network
-    raw: dict  # the file's arrays in numpy: names, ground truth of the toy, center, scale, info
+    raw: dict  # the file in numpy: names, statistics, center, scale, ground truth of the toy
+    info: dict
 
-    @property
-    def info(self):
-        return json.loads(str(self.raw["info"]))
-
-    def photo(self, i: int) -> np.ndarray:
-        """Photo i as (H,W,3) uint8."""
-        w, h = self.raw["wh"][i]
-        return self.raw["rgb"][self.raw["start"][i]:self.raw["start"][i + 1]].reshape(h, w, 3)
+    def photos(self, is_test: bool) -> Tensor:
+        """Numbers (B,) of the held-out photos, or of those to train on."""
+        return torch.nonzero(self.is_test == is_test)[:, 0]
 
 
-def load_scene(arrays: dict | str | Path, device="cpu", mask_px: int = 96) -> Scene:
-    """Scene from a file written by data_prep.py, or from its dictionary. Raises UserError."""
-    if not isinstance(arrays, dict):
-        arrays = dict(np.load(arrays))
-    wh, start = arrays["wh"], arrays["start"]
-    thumbs = np.stack([cv2.resize(arrays["rgb"][start[i]:start[i + 1]].reshape(h, w, 3),
-                                  (mask_px, mask_px), interpolation=cv2.INTER_AREA)
-                       for i, (w, h) in enumerate(wh)])  # (I,H,W,3)
+def load_scene(source: dict | Path, device="cpu", mask_px: int = 96) -> Scene:
+    """Scene from a file of data_prep.py, or from such a file's dictionary. Raises UserError."""
+    raw = source if isinstance(source, dict) else data_prep.read_scene(source)
+    photos = [raw["rgb"][a:b].reshape(h, w, 3)
+              for a, b, (w, h) in zip(raw["start"], raw["start"][1:], raw["wh"])]
+    thumbs = [cv2.resize(p, (mask_px, mask_px), interpolation=cv2.INTER_AREA) for p in photos]
+    thumbs = torch.as_tensor(np.stack(thumbs)).permute(0, 3, 1, 2).contiguous().to(device)
+    kinds = dict(rgb=torch.uint8, start=torch.long, wh=torch.long, is_test=torch.bool)
+    arrays = {k: torch.as_tensor(raw[k]).to(device, kinds.get(k, torch.float32))
+              for k in Scene._fields[:8]}
+    return Scene(**arrays, thumbs=thumbs, raw=raw, info=json.loads(str(raw["info"])))
 
-    def to(key, dtype):
-        return torch.as_tensor(arrays[key]).to(device=device, dtype=dtype)
-    return Scene(to("rgb", torch.uint8), to("start", torch.long), to("wh", torch.long),
-                 to("K", torch.float32), to("c2w", torch.float32), to("near", torch.float32),
-                 to("is_test", torch.bool), to("points", torch.float32), to("track_photo", torch.long),
-                 to("track_point", torch.long),
-                 torch.as_tensor(thumbs).permute(0, 3, 1, 2).to(device).contiguous(), arrays)
+
+CHUNK = 4096  # rays or points evaluated at once outside training
 
 
 class Rays(NamedTuple):
@@ -184,17 +179,21 @@ class Rays(NamedTuple):
     uv: Tensor  # (R,2) pixel position over photo size, 0..1
     rgb: Tensor  # (R,3) the photo's colour
 
+    def at(self, t: Tensor) -> Tensor:
+        """Points (R,S,3) at distances t (R,S)."""
+        return self.o[:, None] + t[:, :, None] * self.d[:, None]
+
 
 def pixel_directions(uv_px: Tensor, K: Tensor) -> Tensor:
     """Unit directions in camera axes of positions uv_px (R,2) px, pixel centres at +0.5."""
     xy = (uv_px - K[:, 2:]) / K[:, :2]  # (R,2)
-    return F.normalize(torch.cat([xy, torch.ones_like(xy[:, :1])], 1), dim=1)  # (R,3)
+    return F.normalize(F.pad(xy, (0, 1), value=1.0), dim=1)  # (R,3)
 
 
 def make_rays(scene: Scene, img: Tensor, pixel: Tensor) -> Rays:
     """Rays through pixels. img, pixel: (R,) photo and row-major pixel number within it."""
     w, h = scene.wh[img].unbind(1)  # (R,)
-    uv = torch.stack([pixel % w, torch.div(pixel, w, rounding_mode="floor")], 1) + 0.5  # (R,2) px
+    uv = torch.stack([pixel % w, pixel // w], 1) + 0.5  # (R,2) px
     c2w = scene.c2w[img]  # (R,3,4)
     d = (c2w[:, :, :3] @ pixel_directions(uv, scene.K[img])[:, :, None])[:, :, 0]  # (R,3)
     rgb = scene.rgb[scene.start[img] + pixel].float() / 255  # (R,3)
@@ -203,40 +202,35 @@ def make_rays(scene: Scene, img: Tensor, pixel: Tensor) -> Rays:
 
 def random_rays(scene: Scene, photos: Tensor, n: int, per_step: int, gen: torch.Generator):
     """n training rays from per_step random photos. Returns Rays and the photos (B,) drawn."""
-    pick = photos[torch.randint(len(photos), (per_step,), generator=gen, device=photos.device)]  # (B,)
+    dev = photos.device
+    pick = photos[torch.randint(len(photos), (per_step,), generator=gen, device=dev)]  # (B,)
     img = pick.repeat_interleave(n // per_step)  # (R,) photo by photo, equally many from each
-    u = torch.rand(len(img), generator=gen, device=photos.device, dtype=torch.float64)  # (R,)
+    u = torch.rand(len(img), generator=gen, device=dev, dtype=torch.float64)  # (R,)
     return make_rays(scene, img, (u * (scene.start[img + 1] - scene.start[img])).long()), pick
 
 
 def sphere_interval(rays: Rays) -> tuple[Tensor, Tensor, Tensor]:
-    """t where each ray enters and leaves the unit sphere, and whether it does: (R,), (R,), (R,).
-
-    A ray that misses the sphere, or has it behind, gets the empty interval at its closest approach (or
-    at near), from where its background starts: no ray is ever dropped, and no square root is negative.
-    """
+    """t where each ray enters and leaves the unit sphere, and whether it does: (R,), (R,), (R,). A
+    ray that misses the sphere, or has it behind, gets the empty interval at its closest approach
+    (or at near), from where its background starts: no ray is dropped, no square root negative."""
     closest = -(rays.o * rays.d).sum(1)  # (R,)
     disc = closest ** 2 - (rays.o ** 2).sum(1) + 1  # (R,)
     half = disc.clamp(min=0).sqrt()  # (R,)
     hit = (disc > 0) & (closest + half > rays.near)  # (R,)
     t0 = torch.maximum(closest - half * hit, rays.near)  # (R,)
-    t1 = torch.maximum(closest + half * hit, t0)  # (R,)
-    return t0, t1, hit
+    return t0, torch.maximum(closest + half * hit, t0), hit
 
 
-# ---------------------------------------------------------------------------------------------------
-# 3 Octree: features on the corners of cells
-# ---------------------------------------------------------------------------------------------------
+# ---- 3 Octree: features on the corners of cells --------------------------------------------------
 
-CORNERS = torch.tensor([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)])  # (8,3), x slowest
+CORNERS = torch.cartesian_prod(*[torch.arange(2)] * 3)  # (8,3), x slowest
 
 
 def trilinear_matrices() -> Tensor:
-    """(8,32): the monomials 1 z y yz x xz xy xyz of a position in a cell times this are the weights of
-    the 8 corners, then their derivatives along x, y, z. Per axis the two ends weigh 1 - f and f.
-    """
-    value, slope = torch.tensor([[1.0, 0], [-1, 1]]), torch.tensor([[-1.0, 1], [0, 0]])  # rows: 1, f
-    axes = [(value, value, value), (slope, value, value), (value, slope, value), (value, value, slope)]
+    """(8,32): the monomials 1 z y yz x xz xy xyz of a position in a cell times this are the weights
+    of the 8 corners, then their derivatives along x, y, z. Per axis the ends weigh 1 - f and f."""
+    value, slope = torch.tensor([[[1.0, 0], [-1, 1]], [[-1, 1], [0, 0]]])  # (2,2) each, rows 1, f
+    axes = [[slope if i == j else value for i in range(3)] for j in (None, 0, 1, 2)]
     return torch.cat([torch.kron(x, torch.kron(y, z)) for x, y, z in axes], 1)
 
 
@@ -244,47 +238,42 @@ TRILINEAR = trilinear_matrices()
 
 
 class Interpolate(torch.autograd.Function):
-    """out[p,j] = sum over the 8 corners k of w[p,j,k] features[corner[p,k]], for J sets of weights.
-
-    The j-th set of weights is the value (j = 0) or its derivative along x, y, z. A fused gather both
-    ways (embedding_bag forward, index_add backward) because this is the hottest operation of a step.
-    Row 0 of the features belongs to the pinned corners: it is zero and gets no gradient.
-    """
-
+    """out[p,j] = sum over the 8 corners k of w[p,j,k] features[corner[p,k]], for J sets of weights:
+    of the value, and of its derivatives along x, y, z. Fused, as the hottest operation of a step.
+    Row 0 of the features belongs to the pinned corners: it is zero and gets no gradient."""
     @staticmethod
     def forward(ctx, features, corner, w):  # (V,C), (P,8), (P,J,8) -> (P,J,C)
         ctx.save_for_backward(corner, w)
         ctx.rows = len(features)
-        return torch.stack([F.embedding_bag(corner, features, per_sample_weights=wj.contiguous(), mode="sum")
-                            for wj in w.unbind(1)], 1)
+        return torch.stack([F.embedding_bag(corner, features, per_sample_weights=wj.contiguous(),
+                                            mode="sum") for wj in w.unbind(1)], 1)
 
     @staticmethod
     def backward(ctx, grad):  # (P,J,C)
         corner, w = ctx.saved_tensors
         spread = torch.bmm(w.transpose(1, 2), grad)  # (P,8,C)
         out = grad.new_zeros(ctx.rows, grad.shape[2])  # (V,C)
-        out.index_add_(0, corner.reshape(-1), spread.reshape(-1, grad.shape[2]))
+        out.index_add_(0, corner.flatten(), spread.flatten(0, 1))
         out[0] = 0
         return out, None, None
 
 
 class Octree(nn.Module):
-    """Feature grid over the cube [-half, half]^3 that is fine only where it has been split.
-
-    Level 0 is a dense grid of root^3 cells; a node points to its first of eight children. Nodes 0..7 are
-    the null block: a leaf's children, and their own. Features live on corners, shared by the cells that
-    meet there. A corner with a missing cell around it ("hanging") is pinned to zero, so that the field
-    is continuous across every face between a refined and an unrefined region. A query concatenates the
-    trilinear features of all levels on its path; absent levels contribute zeros.
-    """
-
-    def __init__(self, half: float, levels: int, root: int = 16, channels: int = 4, std: float = 1e-2):
+    """Feature grid over the cube [-half, half]^3 that is fine only where it has been split. Level 0
+    is a dense grid of root^3 cells; a node points to its first of eight children. Nodes 0-7 are the
+    null block: a leaf's children, and their own. Features live on corners, shared by the cells that
+    meet there. A corner with a missing cell around it ("hanging") is pinned to zero: the field is
+    continuous across the borders of refined regions. A query concatenates the trilinear features of
+    all levels on its path; absent levels contribute zeros."""
+    def __init__(self, half: float, levels: int, channels: int = 4, device="cpu", root: int = 16,
+                 std: float = 1e-2):
         super().__init__()
         self.half, self.levels, self.root, self.std = half, levels, root, std
-        self.features = nn.Parameter(torch.zeros(1, channels))  # (V,C), row 0 pinned
-        self.register_buffer("row_key", torch.zeros(1, dtype=torch.long))  # (V,) level and corner
-        self.register_buffer("scale", torch.tensor([float(self.resolution(i)) for i in range(levels)]))
-        self.build([torch.zeros(0, dtype=torch.long)] * (levels - 1))
+        self.features = nn.Parameter(torch.zeros(1, channels, device=device))  # (V,C), row 0 pinned
+        key = torch.zeros(1, dtype=torch.long, device=device)
+        self.register_buffer("row_key", key)  # (V,) level and corner of each row
+        self.register_buffer("scale", root * 2.0 ** torch.arange(levels, device=device))  # (L,)
+        self.build([key[:0]] * (levels - 1))
         self.features.data[1:].normal_(0, std)
 
     def resolution(self, level: int) -> int:
@@ -294,59 +283,62 @@ class Octree(nn.Module):
         """Side of a cell, scene units."""
         return 2 * self.half / self.resolution(level)
 
+    def centres(self, level: int) -> Tensor:
+        """Centres (N,3) of the cells of a level."""
+        return (self.cells[level] + 0.5) * self.cell(level) - self.half
+
     def key(self, ijk: Tensor, level: int) -> Tensor:
         """One number per cell or corner (...,3) of a level; corners run to resolution inclusive."""
         n = self.resolution(level) + 1
         return (ijk[..., 0] * n + ijk[..., 1]) * n + ijk[..., 2]
 
     def cell_of(self, x: Tensor, level: int) -> Tensor:
-        """Integer coordinates (P,3) of the cell of a level that holds x (P,3), clamped to the cube."""
+        """Integer coordinates (P,3) of the cells of a level that hold x (P,3), clamped."""
         n = self.resolution(level)
         return ((x / (2 * self.half) + 0.5) * n).long().clamp(0, n - 1)
 
-    def build(self, split_keys: list[Tensor]) -> Tensor:
-        """Makes nodes and corners from the keys of the split cells of each level but the last.
+    def around(self, ijk: Tensor, level: int) -> Tensor:
+        """Cells (P,3) and all their neighbours, each once, in the order of appearance: (Q,3)."""
+        step = torch.cartesian_prod(*[torch.arange(-1, 2, device=ijk.device)] * 3)  # (27,3)
+        near = (ijk[:, None] + step).reshape(-1, 3).clamp(0, self.resolution(level) - 1)  # (27P,3)
+        key, order = self.key(near, level).sort(stable=True)
+        is_first = F.pad(key[1:] != key[:-1], (1, 0), value=True)[:len(key)]  # (27P,) in its key
+        return near[order[is_first].sort()[0]]
 
-        Features of corners that exist before and after are kept, new ones are zero. Returns old_row (V,):
-        the former row of every row, 0 (the pinned zero row) for new ones; it remaps optimiser state too.
-        """
-        dev = self.features.device
-        grid = torch.arange(self.root, device=dev)
-        ijk = torch.cartesian_prod(grid, grid, grid)  # (N,3) cells of the level, in node order
-        child, corner, rows, start = [torch.zeros(8, dtype=torch.long, device=dev)], \
-            [torch.zeros(8, 8, dtype=torch.long, device=dev)], [torch.zeros(1, dtype=torch.long, device=dev)], 8
-        n_rows = 1
-        self.split_keys, self.cells = [], []
+    def build(self, split_keys: list[Tensor]) -> Tensor:
+        """Makes nodes and corners from the keys of the split cells of each level but the last. New
+        features are zero. Returns the former row (V,) of every row, 0 (the pinned one) if new."""
+        octant = CORNERS.to(self.features.device)
+        ijk = torch.cartesian_prod(*[torch.arange(self.root, device=octant.device)] * 3)  # (N,3)
+        child, corner, rows = [octant.new_zeros(8)], [octant.new_zeros(8, 8)], [octant.new_zeros(1)]
+        n_rows, n_nodes, self.split_keys, self.cells = 1, 8, [], []
         for level in range(self.levels):
             n = self.resolution(level)
             self.cells.append(ijk)
-            at = ijk[:, None] + CORNERS.to(dev)  # (N,8,3)
-            keys, inverse, count = torch.unique(self.key(at, level), return_inverse=True,
-                                                return_counts=True)
-            k = torch.stack([keys // (n + 1) ** 2, keys // (n + 1) % (n + 1), keys % (n + 1)], 1)
-            free = count == (1 + ((k > 0) & (k < n)).long()).prod(1)  # all cells around it exist
-            row = torch.where(free, n_rows - 1 + free.long().cumsum(0), 0)
-            corner.append(row[inverse])  # (N,8)
+            n_nodes += len(ijk)
+            keys, inverse, count = torch.unique(self.key(ijk[:, None] + octant, level),
+                                                return_inverse=True, return_counts=True)
+            at = torch.stack([keys // (n + 1) ** 2, keys // (n + 1), keys], 1) % (n + 1)  # corners
+            free = count == 2 ** ((at > 0) & (at < n)).sum(1)  # all cells around it exist
+            corner.append(torch.where(free, n_rows - 1 + free.cumsum(0), 0)[inverse])  # (N,8)
             rows.append(keys[free] + ((level + 1) << 40))
-            n_rows += int(free.sum())
-            here = torch.zeros(len(ijk), dtype=torch.long, device=dev)  # (N,) first child
+            n_rows += len(rows[-1])
+            child.append(torch.zeros_like(ijk[:, 0]))  # (N,) first child
             if level + 1 < self.levels:
                 is_split = torch.isin(self.key(ijk, level), split_keys[level])  # (N,)
-                here[is_split] = start + len(ijk) + 8 * torch.arange(int(is_split.sum()), device=dev)
                 self.split_keys.append(self.key(ijk[is_split], level))
-                start += len(ijk)
-                ijk = (2 * ijk[is_split][:, None] + CORNERS.to(dev)).reshape(-1, 3)
-            child.append(here)
+                ijk = (2 * ijk[is_split][:, None] + octant).reshape(-1, 3)  # (N,3) of the next
+                child[-1][is_split] = n_nodes + 8 * torch.arange(len(ijk) // 8, device=ijk.device)
         row_key = torch.cat(rows)
         old_row = torch.searchsorted(self.row_key, row_key).clamp(max=len(self.row_key) - 1)
         old_row = torch.where(self.row_key[old_row] == row_key, old_row, 0)  # (V,)
         self.features = nn.Parameter(self.features.detach()[old_row])  # (V,C)
         self.row_key = row_key
-        self.child, self.corner = torch.cat(child), torch.cat(corner).int()  # (N,), (N,8)
+        self.child, self.corner = torch.cat(child).int(), torch.cat(corner).int()  # (N,), (N,8)
         return old_row
 
     def split(self, level: int, ijk: Tensor) -> Tensor:
-        """Splits cells ijk (P,3) of a level. The function does not change: new features are zero."""
+        """Splits cells ijk (P,3) of a level; the function stays, as new features are zero."""
         keys = list(self.split_keys)
         keys[level] = torch.cat([keys[level], self.key(ijk, level)])
         return self.build(keys)
@@ -358,80 +350,59 @@ class Octree(nn.Module):
         return self.build(keys)
 
     def locate(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Corner rows (P,L,8) of the cells that hold x (P,3), and the position (P,L,3) 0..1 inside."""
+        """Corner rows (P,L,8) of the cells that hold x (P,3), and its place (P,L,3) 0..1 inside."""
         u = (x / (2 * self.half) + 0.5).clamp(0, 1 - 1e-6)  # (P,3)
         at = u[:, None] * self.scale[:, None]  # (P,L,3) in cells
         ijk = at.long()  # (P,L,3)
-        node = 8 + (ijk[:, 0, 0] * self.root + ijk[:, 0, 1]) * self.root + ijk[:, 0, 2]  # (P,)
-        nodes = [node]
+        nodes = [8 + (ijk[:, 0, 0] * self.root + ijk[:, 0, 1]) * self.root + ijk[:, 0, 2]]  # (P,)
         for level in range(1, self.levels):
             bit = ijk[:, level] & 1  # (P,3)
-            node = self.child[node] + bit[:, 0] * 4 + bit[:, 1] * 2 + bit[:, 2]  # (P,)
-            nodes.append(node)
+            nodes.append(self.child[nodes[-1]] + bit[:, 0] * 4 + bit[:, 1] * 2 + bit[:, 2])  # (P,)
         return self.corner[torch.stack(nodes, 1)].long(), at - ijk
 
     def forward(self, x: Tensor, derivatives: bool = False) -> Tensor:
-        """Features (P,L,J,C) at x (P,3); J = 1, or 4: value and its change per cell along x, y, z."""
+        """Features (P,L,J,C) at x (P,3); J = 1, or 4: value, its change per cell along x, y, z."""
         P, L, J = len(x), self.levels, 4 if derivatives else 1
         corner, inside = self.locate(x)  # (P,L,8), (P,L,3)
         fx, fy, fz = inside.reshape(-1, 3).T.contiguous()  # (PL,)
         yz = fy * fz
-        basis = torch.stack([torch.ones_like(fx), fz, fy, yz, fx, fx * fz, fx * fy, fx * yz], 1)  # (PL,8)
-        w = basis @ TRILINEAR[:, :8 * J].to(x.device)  # (PL,8J)
+        basis = torch.stack([torch.ones_like(fx), fz, fy, yz, fx, fx * fz, fx * fy, fx * yz], 1)
+        w = basis @ TRILINEAR[:, :8 * J].to(x.device)  # (PL,8) to (PL,8J)
         out = Interpolate.apply(self.features, corner.reshape(-1, 8), w.reshape(-1, J, 8))
         return out.reshape(P, L, J, -1)
 
     def bytes(self) -> int:
-        """Memory of features and structure."""
+        """Memory of features and of the structure that a query needs."""
         return sum(t.numel() * t.element_size() for t in (self.features, self.child, self.corner))
 
 
 def seed_octree(octree: Octree, points: Tensor, dense: int, shell: tuple[float, float]) -> None:
-    """Splits all cells that touch the shell of radii up to level `dense`; below, those near points.
-
-    Near is one cell on every side, so that the corners around a point are never hanging.
-    """
+    """Splits all cells that touch the shell of radii up to level `dense`; below, those near points:
+    one cell on every side, so that the corners around a point are never hanging."""
     for level in range(octree.levels - 1):
-        ijk = octree.cells[level]  # (N,3)
         if level < dense:
-            centre = (ijk + 0.5) * octree.cell(level) - octree.half  # (N,3)
             reach = octree.cell(level) * math.sqrt(3) / 2
-            r = centre.norm(dim=1)  # (N,)
-            octree.split(level, ijk[(r > shell[0] - reach) & (r < shell[1] + reach)])
+            r = octree.centres(level).norm(dim=1)  # (N,)
+            touches = (r > shell[0] - reach) & (r < shell[1] + reach)  # (N,)
+            octree.split(level, octree.cells[level][touches])
         elif len(points):
-            near = octree.cell_of(points, level)[:, None] + torch.cartesian_prod(
-                *[torch.arange(-1, 2, device=ijk.device)] * 3)  # (K,27,3)
-            octree.split(level, near.reshape(-1, 3).clamp(0, octree.resolution(level) - 1).unique(dim=0))
+            octree.split(level, octree.around(octree.cell_of(points, level), level))
     octree.features.data[1:].normal_(0, octree.std)
 
 
-def levels_for_footprint(scene: Scene, root: int = 16, finest: int = 8) -> int:
-    """Octree levels such that the finest cell is not smaller than a pixel at the surface.
-
-    The footprint of a pixel at an SfM point is depth / focal length; the lower quartile over all
-    observations in training photos counts, so the closest photos decide without single outliers.
-    """
-    seen = ~scene.is_test[scene.track_photo]  # (T,)
-    cam, at = scene.c2w[scene.track_photo[seen]], scene.points[scene.track_point[seen]]
-    footprint = (at - cam[:, :, 3]).norm(dim=1) / scene.K[scene.track_photo[seen], 0]  # (T,) units
-    footprint = footprint[at.norm(dim=1) < 1]
-    if not len(footprint):  # no points: as if the surface were at the centre
-        footprint = scene.c2w[:, :, 3].norm(dim=1) / scene.K[:, 0]
-    cells = 2 / footprint.double().quantile(0.25).item()
-    return int(np.clip(1 + math.floor(math.log2(cells / root)), 2, finest))
+def levels_for_footprint(footprint: float, root: int = 16, finest: int = 8) -> int:
+    """Octree levels such that the finest cell is no smaller than a pixel at the surface."""
+    return int(np.clip(1 + math.floor(math.log2(2 / footprint / root)), 2, finest))
 
 
-# ---------------------------------------------------------------------------------------------------
-# 4 Fields: the networks on top of the octree
-# ---------------------------------------------------------------------------------------------------
+# ---- 4 Fields: the networks on top of the octree -------------------------------------------------
 
 GEO = 15  # length of the geometry feature that the SDF network hands to the colour network
-BETA = 100.0  # sharpness of the softplus in the SDF network: nearly a ReLU, but twice differentiable
+BETA = 100.0  # sharpness of the SDF network's softplus: nearly a ReLU, but twice differentiable
 
 
 class SDFField(nn.Module):
     """s(x) and a geometry feature, from xyz and octree features through one hidden layer. [D9]"""
-
     def __init__(self, octree: Octree, hidden: int):
         super().__init__()
         self.octree = octree
@@ -447,10 +418,8 @@ class SDFField(nn.Module):
 
     def with_gradient(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """sdf (P,), feature (P,GEO) and grad s (P,3) in closed form through the same corners. [D13]
-
         The chain rule written out: ds/dx = ds/dz dz/dx with z = [x, features(x)]. It is an ordinary
-        differentiable expression, so training through normals needs no second-order autograd.
-        """
+        differentiable expression, so training through normals needs no second-order autograd."""
         with torch.autocast(x.device.type, enabled=False):  # [D9]
             feat = self.octree(x, derivatives=True)  # (P,L,4,C)
             h = self.lin1(torch.cat([x, feat[:, :, 0].flatten(1)], 1))  # (P,H)
@@ -462,37 +431,34 @@ class SDFField(nn.Module):
         return out[:, 0], out[:, 1:], grad
 
 
-TETRAHEDRON = torch.tensor([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])  # (4,3) tap directions
+TETRAHEDRON = torch.tensor([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])  # (4,3) directions
 
 
-def finite_differences(sdf, x: Tensor, eps: float, centre: Tensor | None = None) -> tuple[Tensor, Tensor]:
-    """Gradient (P,3) and Laplacian (P,) of sdf at x (P,3) from four tetrahedral taps (Neuralangelo).
-
-    Taps sit at x + eps k / sqrt(3): their mean difference to the centre is eps^2/6 times the Laplacian,
-    their k-weighted mean the gradient. centre: s(x) where the caller has it already.
-    """
+def finite_differences(sdf, x: Tensor, eps: float, centre: Tensor | None = None):
+    """Gradient (P,3) and Laplacian (P,) of sdf at x (P,3) from 4 tetrahedral taps (Neuralangelo).
+    Taps sit at x + eps k / sqrt(3): their mean difference to the centre is eps^2/6 times the
+    Laplacian, their k-weighted mean the gradient. centre: s(x) where the caller has it already."""
     k = TETRAHEDRON.to(x.device) / math.sqrt(3)  # (4,3)
     taps = sdf((x[:, None] + eps * k).reshape(-1, 3)).reshape(-1, 4)  # (P,4)
     centre = sdf(x) if centre is None else centre  # (P,)
     grad = 0.75 / eps * (taps @ k)  # (P,3); sum over taps of k k^T is 4/3 times the identity
-    lap = 6 / eps ** 2 * (taps.mean(1) - centre)  # (P,)
-    return grad, lap
+    return grad, 6 / eps ** 2 * (taps.mean(1) - centre)  # (P,3), (P,)
 
 
 def sh_basis(d: Tensor) -> Tensor:
-    """Real spherical harmonics up to degree 2 of unit directions (R,3) -> (R,9), without constants."""
+    """Real spherical harmonics up to degree 2 of unit directions (R,3) -> (R,9), no constants."""
     x, y, z = d.unbind(1)
-    return torch.stack([torch.ones_like(x), x, y, z, x * y, y * z, z * x, x * x - y * y, 3 * z * z - 1], 1)
+    return torch.stack([torch.ones_like(x), x, y, z,
+                        x * y, y * z, z * x, x * x - y * y, 3 * z * z - 1], 1)  # (R,9)
 
 
 class LipschitzMLP(nn.Module):
-    """MLP whose rows are scaled to an L1 norm of at most softplus(c) per layer (Liu et al. 2022)."""
-
+    """MLP whose rows are scaled to an L1 norm of at most softplus(c) (Liu et al. 2022)."""
     def __init__(self, sizes: list[int]):
         super().__init__()
         self.layers = nn.ModuleList(nn.Linear(a, b) for a, b in zip(sizes, sizes[1:]))
-        bound = [layer.weight.detach().abs().sum(1).max() for layer in self.layers]
-        self.c = nn.Parameter(torch.stack([torch.log(torch.expm1(2 * b)) for b in bound]))  # (layers,)
+        bound = torch.stack([m.weight.detach().abs().sum(1).max() for m in self.layers])
+        self.c = nn.Parameter(torch.log(torch.expm1(2 * bound)))  # (layers,)
 
     def bounds(self) -> Tensor:
         """Lipschitz bound of each layer in the max norm."""
@@ -501,8 +467,8 @@ class LipschitzMLP(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         for i, (layer, bound) in enumerate(zip(self.layers, self.bounds())):
             scale = (bound / layer.weight.abs().sum(1)).clamp(max=1)  # (out,)
-            x = F.linear(x, layer.weight * scale[:, None], layer.bias)
-            x = F.relu(x) if i + 1 < len(self.layers) else x
+            x = F.relu(x) if i else x
+            x = F.linear(x, layer.weight * scale[:, None], layer.bias)  # (P,out)
         return x
 
 
@@ -514,42 +480,34 @@ def contract(x: Tensor) -> Tensor:
 
 class Background(nn.Module):
     """A small NeRF outside the sphere, on an octree over contracted space."""
-
     def __init__(self, octree: Octree, hidden: int, appearance_dim: int):
         super().__init__()
         self.octree = octree
         inputs = 3 + octree.features.shape[1] * octree.levels
-        self.density = nn.Sequential(nn.Linear(inputs, hidden), nn.ReLU(), nn.Linear(hidden, 1 + GEO))
-        self.color = nn.Sequential(nn.Linear(GEO + 9 + appearance_dim, hidden), nn.ReLU(),
-                                   nn.Linear(hidden, 3))
+        self.density, self.color = (
+            nn.Sequential(nn.Linear(a, hidden), nn.ReLU(), nn.Linear(hidden, b))
+            for a, b in ((inputs, 1 + GEO), (GEO + 9 + appearance_dim, 3)))
 
     def forward(self, rays: Rays, start: Tensor, code: Tensor, n: int, jitter: Tensor) -> Tensor:
-        """Colour (R,3) beyond start (R,). code: (R,A); jitter: (R,n) in 0..1. [D8]
-
-        Sections are equal steps of u in t = start + u / (1 - u); the last one is opaque.
-        """
-        edges = torch.arange(n, device=start.device) / n  # (n,)
-        u = edges + jitter / n  # (R,n) stratified
+        """Colour (R,3) beyond start (R,). code: (R,A); jitter: (R,n) in 0..1. [D8] Sections are
+        equal steps of u in t = start + u / (1 - u); the last one is opaque."""
+        u = torch.arange(n, device=start.device) / n + jitter / n  # (R,n) stratified
         t = start[:, None] + u / (1 - u).clamp(min=1e-3)  # (R,n)
-        dt = torch.diff(t, dim=1)  # (R,n-1)
-        x = contract(rays.o[:, None] + t[:, :, None] * rays.d[:, None]).reshape(-1, 3)  # (Rn,3)
+        x = contract(rays.at(t)).reshape(-1, 3)  # (Rn,3)
         out = self.density(torch.cat([x, self.octree(x).flatten(1)], 1)).float()  # (Rn,1+GEO)
         sigma = F.softplus(out[:, 0].reshape(len(t), n) - 1)  # (R,n)
-        alpha = torch.cat([1 - torch.exp(-sigma[:, :-1] * dt), torch.ones_like(t[:, :1])], 1)  # (R,n)
+        alpha = 1 - torch.exp(-sigma[:, :-1] * torch.diff(t, dim=1))  # (R,n-1)
+        w, _ = composite(F.pad(alpha, (0, 1), value=1.0))  # (R,n)
         per_ray = torch.cat([sh_basis(rays.d), code], 1).repeat_interleave(n, 0)  # (Rn,9+A)
         rgb = torch.sigmoid(self.color(torch.cat([out[:, 1:], per_ray], 1)).float())  # (Rn,3)
-        w, _ = composite(alpha)  # (R,n)
         return (w[:, :, None] * rgb.reshape(len(t), n, 3)).sum(1)  # (R,3)
 
 
-# ---------------------------------------------------------------------------------------------------
-# 5 From SDF to colour: sections along the ray, alpha, compositing
-# ---------------------------------------------------------------------------------------------------
+# ---- 5 From SDF to colour: sections along the ray, alpha, compositing ----------------------------
 
 
 class Deviation(nn.Module):
-    """The deviation network: zeta = exp(10 v), one learned number; 1/zeta is the width of a surface."""
-
+    """The deviation network: zeta = exp(10 v), one learned number; 1/zeta is a surface's width."""
     def __init__(self, zeta: float = 20.0):
         super().__init__()
         self.v = nn.Parameter(torch.tensor(math.log(zeta) / 10))
@@ -559,39 +517,32 @@ class Deviation(nn.Module):
 
 
 def neus_alpha(sdf: Tensor, cos: Tensor, dt: Tensor, zeta: Tensor) -> Tensor:
-    """Opacity (R,S) of sections of length dt with SDF sdf and slope cos = <grad s, d> at their middle.
-
+    """Opacity (R,S) of sections of length dt with SDF sdf and slope cos = <grad s, d> mid-way.
     Eq. 1 mended: 1 - sigmoid(zeta s_next) / sigmoid(zeta s_prev) (NeuS Eq. 13) with the two ends
-    s -+ cos dt / 2 inside zeta [D2], divided so that opacities multiply up to one behind a wall [D1].
-    A section that leads outwards (cos > 0) is transparent. Logs of sigmoids neither overflow nor need an
-    epsilon.
-    """
+    s -+ cos dt / 2 inside zeta [D2], divided so that opacities multiply up to 1 behind walls [D1].
+    A section that leads outwards (cos > 0) is transparent. Logs of sigmoids do not overflow."""
     half = F.relu(-cos) * dt / 2  # (R,S)
     return -torch.expm1(F.logsigmoid(zeta * (sdf - half)) - F.logsigmoid(zeta * (sdf + half)))
 
 
 def printed_alpha(sdf: Tensor, cos: Tensor, dt: Tensor, zeta: Tensor) -> Tensor:
-    """Eq. 1 as printed, kept to be shown and tested against: sums to one, but multiplies to 1 - 1/e."""
+    """Eq. 1 as printed, kept to be shown and tested: sums to one, but multiplies to 1 - 1/e."""
     beta = cos * dt / 2  # (R,S)
     after = torch.cat([sdf[:, 1:], sdf[:, -1:]], 1)  # (R,S), s_{i+1}
     return torch.sigmoid(zeta * sdf + beta) - torch.sigmoid(zeta * after + beta)
 
 
 def composite(alpha: Tensor) -> tuple[Tensor, Tensor]:
-    """Weights w_i = T_i alpha_i (R,S) with T_i = prod_{j<i} (1 - alpha_j), and what passes, T (R,). Eq. 2
-
-    The product runs as a sum of logs: its backward needs no look for zeros.
-    """
-    log_pass = torch.log1p(-alpha.clamp(max=1 - 1e-6)).cumsum(1)  # (R,S)
-    trans = torch.exp(log_pass)  # (R,S), after each section
-    before = torch.cat([torch.ones_like(trans[:, :1]), trans[:, :-1]], 1)  # (R,S)
-    return before * alpha, trans[:, -1]
+    """Weights w_i = T_i alpha_i (R,S), T_i = prod_{j<i} (1 - alpha_j); what passes, T (R,). Eq. 2
+    The product runs as a sum of logs: its backward needs no look for zeros."""
+    trans = torch.exp(torch.log1p(-alpha.clamp(max=1 - 1e-6)).cumsum(1))  # (R,S) after each section
+    return F.pad(trans[:, :-1], (1, 0), value=1.0) * alpha, trans[:, -1]
 
 
 def inverse_cdf(edges: Tensor, weight: Tensor, u: Tensor) -> Tensor:
-    """Positions (R,S) where the piecewise linear CDF of weight (R,N) on edges (R,N+1) reaches u (R,S)."""
+    """Positions (R,S) where the linear CDF of weight (R,N) on edges (R,N+1) reaches u (R,S)."""
     cdf = torch.cumsum(weight, 1)
-    cdf = torch.cat([torch.zeros_like(cdf[:, :1]), cdf / cdf[:, -1:]], 1)  # (R,N+1)
+    cdf = F.pad(cdf / cdf[:, -1:], (1, 0))  # (R,N+1)
     hi = torch.searchsorted(cdf, u.contiguous(), right=True).clamp(1, weight.shape[1])  # (R,S)
     c0, c1 = cdf.gather(1, hi - 1), cdf.gather(1, hi)  # (R,S)
     e0, e1 = edges.gather(1, hi - 1), edges.gather(1, hi)  # (R,S)
@@ -604,99 +555,88 @@ FLOOR = 0.2  # share of samples spread uniformly, so that a lost surface can ret
 
 def cached_weight(cache: Tensor, rays: Rays, edges: Tensor, zeta: float) -> Tensor:
     """NeuS weights (R,N) of sections (R,N+1) from the cached SDF volume (1,1,n,n,n). [D11]"""
-    x = rays.o[:, None] + edges[:, :, None] * rays.d[:, None]  # (R,N+1,3)
-    s = F.grid_sample(cache, x.flip(-1)[None, None], padding_mode="border",
-                      align_corners=True)[0, 0, 0]  # (R,N+1)
-    log_phi = F.logsigmoid(zeta * s)
-    alpha = -torch.expm1((log_phi[:, 1:] - log_phi[:, :-1]).clamp(max=0))  # (R,N)
+    x = rays.at(edges).flip(-1)[None, None]  # (1,1,R,N+1,3) as grid_sample wants it, z first
+    s = F.grid_sample(cache, x, padding_mode="border", align_corners=True)[0, 0, 0]  # (R,N+1)
+    alpha = -torch.expm1(torch.diff(F.logsigmoid(zeta * s)).clamp(max=0))  # (R,N)
     return composite(alpha)[0]
 
 
-def sample_sections(model: "GeoNVS", rays: Rays, t0: Tensor, t1: Tensor, n: int, jitter: Tensor) -> Tensor:
-    """Edges (R,n+1) of n sections between t0 and t1 (R,), dense where the cached SDF sees a surface.
-
-    jitter: (R,n) in 0..1, stratifies the n - 1 inner edges.
-    """
+def sample_sections(model: "GeoNVS", rays: Rays, t0: Tensor, t1: Tensor, n: int, jitter: Tensor):
+    """Edges (R,n+1) of n sections from t0 to t1 (R,), dense where the cached SDF sees a surface.
+    jitter: (R,n) in 0..1, stratifies the n - 1 inner edges."""
     u = (torch.arange(n - 1, device=t0.device) + jitter[:, :-1]) / (n - 1)  # (R,n-1)
     probes = torch.linspace(0, 1, PROBES + 1, device=t0.device)  # (N+1,)
     edges = t0[:, None] + (t1 - t0)[:, None] * probes  # (R,N+1)
-    weight = torch.full_like(edges[:, 1:], 1.0)  # (R,N)
+    weight = torch.ones_like(edges[:, 1:])  # (R,N)
     if model.cfg.sampling == "cached":
         zeta = model.deviation().clamp(max=model.cache.shape[-1])  # a surface as wide as a voxel
-        weight = cached_weight(model.cache, rays, edges, zeta)
+        weight = cached_weight(model.cache, rays, edges, zeta)  # (R,N)
         weight = weight + (FLOOR / (1 - FLOOR) * weight.sum(1, keepdim=True) + 1e-3) / PROBES
     return torch.cat([t0[:, None], inverse_cdf(edges, weight, u), t1[:, None]], 1)  # (R,n+1)
 
 
 def render_rays(model: "GeoNVS", rays: Rays, code: Tensor, jitter: Tensor) -> dict[str, Tensor]:
     """One ray batch through the whole model. code: (R,A) appearance; jitter: (R,S+B) in 0..1.
-
-    Returns rgb (R,3), opacity (R,), depth (R,), normal (R,3), e_grad (R,), e_curv (R,), plus x, grad, w
-    for the losses. e_grad and e_curv are the NeuS-weighted eikonal error and curvature of Eq. 4. [D3]
-    """
+    Returns rgb (R,3), opacity, depth (R,), normal (R,3), e_grad, e_curv (R,): the NeuS-weighted
+    eikonal error and curvature of Eq. 4 [D3]; hit (R,), the rays' ends x (R,3), eikonal (R,S)."""
     cfg, R, S = model.cfg, len(rays.o), model.cfg.samples
     t0, t1, hit = sphere_interval(rays)  # (R,)
     with torch.no_grad():
         edges = sample_sections(model, rays, t0, t1, S, jitter[:, :S])  # (R,S+1)
-    dt = torch.diff(edges, dim=1)  # (R,S)
     t = (edges[:, 1:] + edges[:, :-1]) / 2  # (R,S)
-    x = (rays.o[:, None] + t[:, :, None] * rays.d[:, None]).reshape(-1, 3)  # (RS,3)
+    x = rays.at(t).reshape(-1, 3)  # (RS,3)
     if cfg.normals == "fd":
         sdf, geo = model.sdf(x)  # (RS,), (RS,GEO)
-        grad, lap = finite_differences(lambda y: model.sdf(y)[0], x, model.eps, sdf)  # (RS,3), (RS,)
+        grad, lap = finite_differences(lambda y: model.sdf(y)[0], x, model.eps, sdf)  # (RS,3)
     else:
         sdf, geo, grad = model.sdf.with_gradient(x)  # (RS,), (RS,GEO), (RS,3) [D13]
     normal = F.normalize(grad, dim=1)  # (RS,3)
     cos = (grad.reshape(R, S, 3) * rays.d[:, None]).sum(2)  # (R,S)
-    alpha_fn = neus_alpha if cfg.alpha == "neus" else printed_alpha
-    alpha = alpha_fn(sdf.reshape(R, S), cos, dt, model.deviation()) * hit[:, None]  # (R,S)
-    w, trans = composite(alpha)  # (R,S), (R,)
+    opacity_of = neus_alpha if cfg.alpha == "neus" else printed_alpha
+    alpha = opacity_of(sdf.reshape(R, S), cos, torch.diff(edges), model.deviation())  # (R,S)
+    w, trans = composite(alpha * hit[:, None])  # (R,S), (R,)
     per_ray = torch.cat([sh_basis(rays.d), code], 1)[:, None].expand(R, S, -1).reshape(R * S, -1)
     rgb_s = torch.sigmoid(model.color(torch.cat([geo, normal, per_ray], 1)).float())  # (RS,3)
     rgb = (w[:, :, None] * rgb_s.reshape(R, S, 3)).sum(1)  # (R,3)
+    behind = model.bg_color  # (3,)
     if model.background is not None:
         behind = model.background(rays, t1, code, cfg.bg_samples, jitter[:, S:])  # (R,3)
-    else:
-        behind = model.bg_color.expand(R, 3)  # (R,3)
     opacity = w.sum(1)  # (R,)
     depth = (w * t).sum(1) + trans * t1  # (R,)
-    if cfg.normals == "analytic":  # four taps at the rendered surface, for the curvature alone
-        at = rays.o + depth.detach()[:, None] * rays.d  # (R,3)
-        _, lap = finite_differences(lambda y: model.sdf(y)[0], at, model.eps)  # (R,)
-        e_curv = lap.abs() * model.eps * opacity  # (R,)
-    else:
+    end = rays.o + depth.detach()[:, None] * rays.d  # (R,3) where the ray ends
+    if cfg.normals == "fd":
         e_curv = (w * lap.reshape(R, S).abs()).sum(1) * model.eps  # (R,)
-    error = (grad.norm(dim=1) - 1) ** 2  # (RS,)
-    return dict(rgb=rgb + trans[:, None] * behind, opacity=opacity, depth=depth, hit=hit,
-                normal=(w[:, :, None] * normal.reshape(R, S, 3)).sum(1), e_curv=e_curv,
-                e_grad=(w * error.reshape(R, S)).sum(1), eikonal=error.reshape(R, S))
+    else:  # four taps where the ray ends, for the curvature alone
+        _, lap = finite_differences(lambda y: model.sdf(y)[0], end, model.eps)  # (R,)
+        e_curv = lap.abs() * model.eps * opacity  # (R,)
+    error = ((grad.norm(dim=1) - 1) ** 2).reshape(R, S)
+    return dict(rgb=rgb + trans[:, None] * behind, opacity=opacity, depth=depth, hit=hit, x=end,
+                normal=(w[:, :, None] * normal.reshape(R, S, 3)).sum(1),
+                e_curv=e_curv, e_grad=(w * error).sum(1), eikonal=error)
 
 
-# ---------------------------------------------------------------------------------------------------
-# 6 Photos in the wild: transient mask and geometry preservation
-# ---------------------------------------------------------------------------------------------------
+# ---- 6 Photos in the wild: transient mask and geometry preservation ------------------------------
 
 
-def conv(cin: int, cout: int, size: int = 3, stride: int = 1, dilation: int = 1, groups: int = 1):
-    return nn.Sequential(nn.Conv2d(cin, cout, size, stride, dilation * (size // 2), dilation, groups,
-                                   bias=False), nn.GroupNorm(8, cout), nn.PReLU(cout))  # [D6]
+def conv(cin: int, cout: int, size: int = 3, stride: int = 1) -> nn.Sequential:
+    return nn.Sequential(nn.Conv2d(cin, cout, size, stride, size // 2, bias=False),
+                         nn.GroupNorm(8, cout), nn.PReLU(cout))  # [D6]
 
 
 class ContextBlock(nn.Module):
-    """Context-guided block (CGNet Fig. 3): local and dilated surrounding context, gated globally."""
-
+    """Context-guided block (CGNet Fig. 3): local and dilated context, gated globally."""
     def __init__(self, cin: int, cout: int, stride: int, dilation: int):
         super().__init__()
         half = cout // 2
         self.reduce = conv(cin, half, 3 if stride == 2 else 1, stride)
-        self.local = nn.Conv2d(half, half, 3, padding=1, groups=half, bias=False)
-        self.around = nn.Conv2d(half, half, 3, padding=dilation, dilation=dilation, groups=half, bias=False)
+        self.local = nn.Conv2d(half, half, 3, 1, 1, groups=half, bias=False)
+        self.around = nn.Conv2d(half, half, 3, 1, dilation, dilation, half, bias=False)
         self.join = nn.Sequential(nn.GroupNorm(8, cout), nn.PReLU(cout))
-        self.gate = nn.Sequential(nn.Linear(cout, cout // 8), nn.ReLU(), nn.Linear(cout // 8, cout),
-                                  nn.Sigmoid())
+        self.gate = nn.Sequential(nn.Linear(cout, cout // 8), nn.ReLU(),
+                                  nn.Linear(cout // 8, cout), nn.Sigmoid())
 
     def forward(self, x: Tensor) -> Tensor:
-        y = self.reduce(x)
+        y = self.reduce(x)  # (B,cout/2,h,w)
         y = self.join(torch.cat([self.local(y), self.around(y)], 1))  # (B,cout,h,w)
         y = y * self.gate(y.mean((2, 3)))[:, :, None, None]
         return y + x if y.shape == x.shape else y
@@ -704,53 +644,44 @@ class ContextBlock(nn.Module):
 
 class CGNet(nn.Module):
     """Whole photos (B,3,H,W) in 0..1 to transient logits (B,1,H/2,W/2) (CGNet, as in CR-NeRF). [D6]
-
-    The head reads all three resolutions: at 1/8 alone a mask could not follow a person's outline.
-    """
-
+    The head reads all three resolutions: at 1/8 alone a mask could not follow an outline."""
     def __init__(self, width: int = 16):
         super().__init__()
-        self.stem = nn.Sequential(conv(3, width, stride=2), conv(width, width))
-        self.stage2 = nn.Sequential(ContextBlock(width, 2 * width, 2, 2), ContextBlock(2 * width, 2 * width, 1, 2))
-        self.stage3 = nn.Sequential(ContextBlock(2 * width, 4 * width, 2, 4),
-                                    ContextBlock(4 * width, 4 * width, 1, 4))
-        self.heads = nn.ModuleList(nn.Conv2d(width * k, 1, 1) for k in (1, 2, 4))
-        for head in self.heads:
-            nn.init.zeros_(head.bias)
-        nn.init.constant_(self.heads[0].bias, -2.5)  # starts with 8 % masked, not with half the picture
+        a, b, c = width, 2 * width, 4 * width
+        self.stem = nn.Sequential(conv(3, a, stride=2), conv(a, a))
+        self.stage2 = nn.Sequential(ContextBlock(a, b, 2, 2), ContextBlock(b, b, 1, 2))
+        self.stage3 = nn.Sequential(ContextBlock(b, c, 2, 4), ContextBlock(c, c, 1, 4))
+        self.heads = nn.ModuleList(nn.Conv2d(k, 1, 1) for k in (a, b, c))
+        for head, bias in zip(self.heads, (-2.5, 0.0, 0.0)):
+            nn.init.constant_(head.bias, bias)  # starts with 8 % masked, not with half the picture
 
     def forward(self, photo: Tensor) -> Tensor:
-        y1 = self.stem(photo - 0.5)
-        y2 = self.stage2(y1)
-        y3 = self.stage3(y2)
-        size = y1.shape[2:]
-        up = [F.interpolate(head(y).float(), size, mode="bilinear", align_corners=False)
-              for head, y in zip(self.heads, (y1, y2, y3))]
-        return sum(up)  # (B,1,H/2,W/2)
+        y1 = self.stem(photo - 0.5)  # (B,a,H/2,W/2)
+        y2 = self.stage2(y1)  # (B,b,H/4,W/4)
+        y3 = self.stage3(y2)  # (B,c,H/8,W/8)
+        return sum(F.interpolate(head(y).float(), y1.shape[2:], mode="bilinear")
+                   for head, y in zip(self.heads, (y1, y2, y3)))  # (B,1,H/2,W/2)
 
 
 def mask_at(logits: Tensor, uv: Tensor) -> Tensor:
     """M (R,) at uv (R,2) in 0..1 of logits (B,1,h,w); rays come photo by photo, R / B from each."""
-    B, R = len(logits), len(uv)
-    grid = (2 * uv - 1).reshape(B, R // B, 1, 2)  # (B,R/B,1,2)
-    return torch.sigmoid(F.grid_sample(logits, grid, padding_mode="border", align_corners=False)).reshape(R)
+    grid = (2 * uv - 1).reshape(len(logits), -1, 1, 2)  # (B,R/B,1,2)
+    at = F.grid_sample(logits, grid, padding_mode="border", align_corners=False)  # (B,1,R/B,1)
+    return torch.sigmoid(at).flatten()  # (R,)
 
 
 def edge_indicator(e_grad: Tensor, e_curv: Tensor, lam_grad: float, lam_lap: float,
                    calibration: Tensor | None) -> Tensor:
-    """Phi (R,) from the rays' eikonal error and curvature. Eq. 4
-
-    calibration (2,): centre and width of the sigmoid. None is the literal reading: as both errors are
-    positive, Phi then lies between 0.5 and 1 for every ray and marks nothing. Detached [D3]: Phi is to
-    hold back the mask, not to be lowered by smoothing the geometry away.
-    """
+    """Phi (R,) from the rays' eikonal error and curvature. Eq. 4 calibration (2,): centre and width
+    of the sigmoid. None is the literal reading: Phi then lies between 0.5 and 1 for every ray and
+    marks nothing. Detached [D3]: Phi is to hold back the mask, not to smooth geometry away."""
     x = (lam_grad * e_grad + lam_lap * e_curv).detach()  # (R,)
     return torch.sigmoid(x if calibration is None else (x - calibration[0]) / calibration[1])
 
 
 def calibrate(x: Tensor, calibration: Tensor, rate: float = 0.05) -> None:
-    """Moves calibration (2,) towards the batch: centre = 75th percentile, width = (p95 - p50) / 4. [D3]"""
-    p50, p75, p95 = torch.quantile(x.detach(), torch.tensor([0.5, 0.75, 0.95], device=x.device))
+    """Moves calibration (2,) to the batch's: 75th percentile and width (p95 - p50) / 4. [D3]"""
+    p50, p75, p95 = torch.quantile(x.detach().nan_to_num(), x.new_tensor([0.5, 0.75, 0.95]))
     calibration.lerp_(torch.stack([p75, ((p95 - p50) / 4).clamp(min=1e-3)]), rate)
 
 
@@ -759,126 +690,198 @@ def gpl_loss(mask: Tensor, edge: Tensor) -> Tensor:
     return (mask * edge).mean()
 
 
-# ---------------------------------------------------------------------------------------------------
-# 7 The model and its objective
-# ---------------------------------------------------------------------------------------------------
+# ---- 7 The model and its objective ---------------------------------------------------------------
 
 
-def observed_pixels(scene: Scene) -> tuple[Tensor, Tensor]:
-    """Where SfM found its points: pixel (T,) within photo track_photo, and whether it is in the photo."""
-    c2w, K = scene.c2w[scene.track_photo], scene.K[scene.track_photo]  # (T,3,4), (T,4)
-    at = scene.points[scene.track_point] - c2w[:, :, 3]  # (T,3)
-    cam = (at[:, None] @ c2w[:, :, :3])[:, 0]  # (T,3) in camera axes
-    uv = (cam[:, :2] / cam[:, 2:].clamp(min=1e-6) * K[:, :2] + K[:, 2:]).floor()  # (T,2) px
-    wh = scene.wh[scene.track_photo]
-    ok = (cam[:, 2] > 0) & (uv >= 0).all(1) & (uv < wh).all(1)
-    uv = torch.minimum(uv.clamp(min=0), wh - 1).long()
-    return uv[:, 1] * wh[:, 0] + uv[:, 0], ok
+def blur(x: Tensor) -> Tensor:
+    """Mean over 3x3 pixels of (B,1,h,w)."""
+    return F.avg_pool2d(x, 3, 1, 1)
 
 
-def exposure_spread(scene: Scene) -> float:
-    """Standard deviation over photos of how much brighter each shows the same SfM points, 0..1 sRGB."""
-    pixel, ok = observed_pixels(scene)
-    ok &= ~scene.is_test[scene.track_photo]
-    img, point = scene.track_photo[ok], scene.track_point[ok]
-    if not len(img):
-        return math.inf  # nothing known: assume the general case
-
-    def mean_by(index, value, n):
-        total = value.new_zeros(n).index_add_(0, index, value)
-        return total / torch.bincount(index, minlength=n).clamp(min=1)
-    grey = scene.rgb[scene.start[img] + pixel[ok]].float().mean(1) / 255  # (T,)
-    offset = grey - mean_by(point, grey, len(scene.points))[point]
-    return mean_by(img, offset, len(scene.wh))[img.unique()].std().item()
-
-
-def constant_background(scene: Scene, gen: torch.Generator) -> Tensor | None:
-    """The one colour (3,) of all rays that miss the sphere, or None if they differ or there are none."""
-    photos = torch.nonzero(~scene.is_test)[:, 0]
-    rays, _ = random_rays(scene, photos, 20_000, min(len(photos), 100), gen)
-    rgb = rays.rgb[~sphere_interval(rays)[2]]
-    return rgb.mean(0) if len(rgb) > 100 and rgb.std(0).max() < 0.01 else None
-
-
-def mask_loss(mask: Tensor, lam_bimodal: float) -> Tensor:
-    """L_reg: mean M keeps the mask small; a pole at M = 1/2, scaled by lam_bimodal, pushes it to 0 or 1.
-
-    Ha-NeRF's mean M^2 belongs to a squared error. With an L1 error e it ends at M = e / (2 lam), a mask on
-    every pixel that is not perfect yet; mean M turns lam_mask into a threshold on e. [D7]
-    """
-    return mask.mean() + lam_bimodal * (1 / ((mask - 0.5) ** 2 + 0.02)).mean()
+def bimodality(mask: Tensor) -> Tensor:
+    """The second half of L_reg: a pole at 1/2 that pushes M to 0 or 1 (Ha-NeRF's digit loss)."""
+    return (1 / ((mask - 0.5) ** 2 + 0.02)).mean()
 
 
 def random_ball(n: int, gen: torch.Generator) -> Tensor:
     """Uniform points (n,3) in the unit ball."""
-    direction = F.normalize(torch.randn(n, 3, generator=gen, device=gen.device), dim=1)
+    direction = F.normalize(torch.randn(n, 3, generator=gen, device=gen.device), dim=1)  # (n,3)
     return direction * torch.rand(n, 1, generator=gen, device=gen.device) ** (1 / 3)
 
 
-class GeoNVS(nn.Module):
-    """The paper's model. Everything it learns and everything it caches."""
+class Method(nn.Module):
+    """What the training loop asks of a method, with the answers that most of them give."""
+    def octrees(self) -> list[Octree]:
+        return []
 
-    WARM_UP, RADIUS = 200, 0.5  # sphere initialisation: steps, radius
+    def codes(self) -> Tensor:
+        """Appearance codes (I,A) of all photos."""
+        return self.appearance.weight
 
-    def __init__(self, cfg: Config, scene: Scene, gen: torch.Generator):
+    def start(self, gen: torch.Generator) -> None:
+        """Before the first step."""
+
+    def batch(self, photos: Tensor, gen: torch.Generator) -> tuple[Rays, Tensor]:
+        """Rays of one step and the photos (B,) they come from."""
+        return random_rays(self.scene, photos, self.cfg.rays, self.cfg.photos, gen)
+
+    def maintain(self, step: int, progress: float, optimizer: torch.optim.Optimizer) -> None:
+        """After every step."""
+
+
+def worst_cells(octree: Octree, level: int, hits: Tensor, bound: float) -> Tensor:
+    """Cells (Q,3) where rays end that miss their colour by more than bound on average, and those
+    around them, worst first. hits: (P,4) where rays ended, and their error."""
+    at, which = octree.cell_of(hits[:, :3], level).unique(dim=0, return_inverse=True)
+    error = hits.new_zeros(len(at)).index_add_(0, which, hits[:, 3])  # (Q,)
+    error = error / torch.bincount(which, minlength=len(at))  # (Q,) mean over the rays
+    worst = error.argsort(descending=True)
+    return octree.around(at[worst[error[worst] > bound]], level)
+
+
+REFINE_AT = (0.1, 0.2, 0.3, 0.45, 0.6)  # shares of training at which the octree is refined
+SPLIT_BYTES = 512  # memory of one split: eight nodes and about as many corners
+MASK_FROM = 0.2  # share of training after which the mask may act: before, every pixel is wrong
+
+
+class GeoNVS(Method):
+    """The paper's model: what it learns, and what it caches to be fast."""
+    def __init__(self, cfg: Config, scene: Scene, gen: torch.Generator | None = None):
         super().__init__()
-        self.cfg, self.scene = cfg, scene
-        dev = scene.rgb.device
+        self.cfg, self.scene, self.step, self.refined = cfg, scene, 0, 0
+        self.use_mask, dev = cfg.mask != "off", scene.rgb.device
         inside = scene.points.norm(dim=1) < 1
-        self.register_buffer("sfm", scene.points[inside])  # (K,3)
-        levels = cfg.levels or levels_for_footprint(scene)
-        fg = Octree(1.0, levels, channels=cfg.channels).to(dev)
-        seed_octree(fg, self.sfm, 1 if len(self.sfm) else levels, (0.0, 1.0))
-        self.sdf = SDFField(fg, cfg.hidden)
-        spread = exposure_spread(scene)
-        self.use_appearance = cfg.appearance == "on" or (cfg.appearance == "auto" and spread > 0.01)
-        A = cfg.appearance_dim if self.use_appearance else 0
+        self.sfm = scene.points[inside]  # (K,3)
+        levels = cfg.levels or levels_for_footprint(float(scene.raw["footprint"]))
+        octree = Octree(1.0, levels, cfg.channels, dev)
+        dense = 1 if len(self.sfm) and cfg.grid == "octree" else levels
+        seed_octree(octree, self.sfm, dense, (0.0, 1.0))  # [D10]
+        self.eps = octree.cell(levels - 1) / 2
+        spread, sky = float(scene.raw["exposure_spread"]), torch.as_tensor(scene.raw["bg_color"])
+        has_codes = cfg.appearance == "on" or cfg.appearance == "auto" and spread > 0.01
+        A = cfg.appearance_dim * has_codes
+        self.sdf = SDFField(octree, cfg.hidden)
         self.appearance = nn.Embedding(len(scene.wh), A)
         nn.init.normal_(self.appearance.weight, std=0.01)
         self.color = LipschitzMLP([GEO + 3 + 9 + A, cfg.hidden, cfg.hidden, 3])
-        one_color = constant_background(scene, gen) if cfg.background == "auto" else None
         self.background = None
-        if cfg.background == "on" or (cfg.background == "auto" and one_color is None):
-            bg = Octree(2.0, cfg.bg_levels, channels=cfg.channels).to(dev)
-            seed_octree(bg, contract(scene.points[~inside]), 1, (1.0, 2.0))
-            self.background = Background(bg, cfg.hidden, A)
-        self.register_buffer("bg_color", one_color if one_color is not None else torch.zeros(3))
-        self.use_mask = cfg.mask != "off"
-        self.cgnet = CGNet()
-        self.register_buffer("logits", torch.full((len(scene.wh), 1, cfg.mask_px // 2, cfg.mask_px // 2), -9.0))
-        self.deviation = Deviation()
-        self.register_buffer("calibration", torch.tensor([0.0, 1.0]))  # centre and width in Phi
-        n = int(np.clip(16 << (levels - 1), 64, 128))
-        self.register_buffer("cache", torch.zeros(1, 1, n, n, n))  # SDF for placing samples
-        self.eps, self.step = fg.cell(levels - 1) / 2, 0
+        if cfg.background == "on" or cfg.background == "auto" and sky.isnan().any():
+            outer = Octree(2.0, cfg.bg_levels, cfg.channels, dev)
+            seed_octree(outer, contract(scene.points[~inside]), 1, (1.0, 2.0))
+            self.background = Background(outer, cfg.hidden, A)
+        self.deviation, self.cgnet = Deviation(), CGNet()
+        I, n, m = len(scene.wh), np.clip(octree.resolution(levels - 1), 64, 128), cfg.mask_px // 2
+        memory = dict(
+            bg_color=sky.float().nan_to_num(0.5), calibration=torch.tensor([0.0, 1.0]),
+            level=torch.tensor(0.2),  # running median of the L1 error
+            cache=torch.zeros(1, 1, n, n, n),  # SDF on a dense grid, for placing samples [D11]
+            hits=torch.full((2 ** 15, 4), 2.0),  # where recent rays ended, and their error
+            logits=torch.full((I, 1, m, m), -9.0),  # last output of the mask network
+            seen=torch.full((I, 2, m, m), -1.0))  # last error and Phi by pixel
+        for name, value in memory.items():
+            self.register_buffer(name, value)
         self.to(dev)
-        print(f"  finest cell {fg.cell(levels - 1):.4f} ({levels} levels), {sum(map(len, fg.cells)):,} cells, "
-              f"exposure spread {spread:.3f}: appearance {'on' if A else 'off'}, "
-              f"background {'on' if self.background else 'one colour'}, mask {cfg.mask}")
+        print(f"  {levels} levels, finest cell {octree.cell(levels - 1):.4f}, "
+              f"{sum(map(len, octree.cells)):,} cells; exposures spread by {spread:.3f}: "
+              f"appearance {'on' if A else 'off'}; "
+              f"background {'on' if self.background else 'one colour'}; mask {cfg.mask}")
+
+    def get_extra_state(self) -> dict:
+        return dict(step=self.step, refined=self.refined, use_mask=self.use_mask)
+
+    def set_extra_state(self, state: dict) -> None:
+        self.step, self.refined, self.use_mask = state["step"], state["refined"], state["use_mask"]
+
+    def octrees(self) -> list[Octree]:
+        return [part.octree for part in (self.sdf, self.background) if part is not None]
 
     def groups(self) -> list[dict]:
         """Optimiser groups: features fast, networks and codes slower, zeta on its own."""
-        cfg = self.cfg
-        grids = [o.features for o in self.octrees()]
-        own = {id(p) for p in grids} | {id(self.deviation.v)}
-        rest = [p for p in self.parameters() if id(p) not in own]
-        return [dict(params=grids, lr=cfg.lr_grid), dict(params=rest, lr=cfg.lr_net),
-                dict(params=[self.deviation.v], lr=cfg.lr_zeta)]
+        grids, zeta = [o.features for o in self.octrees()], self.deviation.v
+        nets = [p for p in self.parameters() if all(p is not q for q in (*grids, zeta))]
+        return [dict(params=grids, lr=self.cfg.lr_grid), dict(params=nets, lr=self.cfg.lr_net),
+                dict(params=[zeta], lr=self.cfg.lr_zeta)]
 
-    def octrees(self) -> list[Octree]:
-        return [self.sdf.octree] + ([self.background.octree] if self.background else [])
-
-    def start(self, gen: torch.Generator) -> None:
+    def start(self, gen: torch.Generator, steps: int = 200, radius: float = 0.5) -> None:
         """Warm-up: L_sphere fits the SDF to a sphere, from where every surface can be reached."""
-        adam = torch.optim.Adam([dict(params=[self.sdf.octree.features], lr=1e-3),
-                                 dict(params=[*self.sdf.lin1.parameters(), *self.sdf.lin2.parameters()], lr=5e-3)])
-        for _ in range(self.WARM_UP):
+        nets = [*self.sdf.lin1.parameters(), *self.sdf.lin2.parameters()]
+        grid = dict(params=[self.sdf.octree.features], lr=1e-3)
+        adam = torch.optim.Adam([grid, dict(params=nets, lr=5e-3)])
+        for _ in range(steps):
             x = random_ball(2048, gen)  # (P,3)
-            loss = ((self.sdf(x)[0] - (x.norm(dim=1) - self.RADIUS)) ** 2).mean()
+            loss = ((self.sdf(x)[0] - (x.norm(dim=1) - radius)) ** 2).mean()
             adam.zero_grad()
             loss.backward()
             adam.step()
         self.refresh_cache(0, 1)
+
+    def losses(self, rays: Rays, pick: Tensor, progress: float, gen: torch.Generator):
+        """The objective, Eq. 5: its weighted sum, and by name the raw terms and health signals."""
+        cfg, R, K, dev = self.cfg, len(rays.o), len(self.sfm), rays.o.device
+        jitter = torch.rand(R, cfg.samples + cfg.bg_samples, generator=gen, device=dev)  # (R,S+B)
+        out = render_rays(self, rays, self.appearance(rays.img), jitter)
+        e_grad, e_curv, hit = out["e_grad"], out["e_curv"], out["hit"]  # (R,)
+        error = (out["rgb"] - rays.rgb).abs().mean(1)  # (R,) L1
+        is_masking = self.use_mask and progress > MASK_FROM
+        mask = mask_at(self.logits[pick], rays.uv) * is_masking  # (R,)
+        calibrate(cfg.lam_grad * e_grad + cfg.lam_lap * e_curv, self.calibration)
+        calibration = self.calibration if cfg.gpl == "calibrated" else None
+        edge = edge_indicator(e_grad, e_curv, cfg.lam_grad, cfg.lam_lap, calibration)  # (R,)
+        edge = out["opacity"].detach() * edge  # (R,)
+        sfm = torch.randint(max(K, 1), (R // 2 if K else 0,), generator=gen, device=dev)  # (R/2,)
+        s = self.sdf(torch.cat([random_ball(R // 2, gen), self.sfm[sfm]]))[0]  # (R/2 + R/2,)
+        raw = dict(rgb=((1 - mask) * error).mean(),
+                   eik=(out["eikonal"].mean(1) * hit).sum() / hit.sum().clamp(min=1),
+                   curv=e_curv.mean(),  # [D4]
+                   lps=torch.log(self.color.bounds()).sum(),  # [D5]
+                   off=torch.exp(-50 * s[:R // 2].abs()).mean(),
+                   sfm=s[R // 2:].abs().sum() / max(R // 2, 1),  # [D10]
+                   mask=mask.mean(), gpl=gpl_loss(mask, edge))
+        total = (raw["rgb"] + cfg.lam_eik * raw["eik"] + cfg.lam_curv * raw["curv"]
+                 + cfg.lam_lps * raw["lps"] + cfg.lam_off * raw["off"] + cfg.lam_sfm * raw["sfm"])
+        misfit = error.detach().nan_to_num()  # (R,) what is remembered stays finite
+        self.level.lerp_(misfit.median(), 0.02)
+        if is_masking:
+            self.remember(rays, misfit, edge.nan_to_num())
+            if self.step % cfg.mask_every == 0:
+                total = total + self.mask_objective(pick)
+        slot = (self.step * R + torch.arange(R, device=dev)) % len(self.hits)  # (R,)
+        self.hits[slot] = torch.cat([out["x"], ((1 - mask) * misfit)[:, None]], 1).nan_to_num(2.0)
+        health = dict(zeta=self.deviation(), opacity=out["opacity"].mean(),
+                      miss=1 - hit.float().mean(), mse=((out["rgb"] - rays.rgb) ** 2).mean())
+        return total, {k: v.detach() for k, v in (raw | health).items()}
+
+    def remember(self, rays: Rays, error: Tensor, edge: Tensor) -> None:
+        """Keeps error and Phi (R,) where the mask network will look for them."""
+        m = self.seen.shape[-1]
+        col, row = (rays.uv * m).long().clamp(max=m - 1).unbind(1)  # (R,)
+        self.seen[rays.img, :, row, col] = torch.stack([error, edge], 1)
+
+    def mask_objective(self, pick: Tensor) -> Tensor:
+        """The terms of Eq. 5 that hold M, over all pixels of photos (B,) that rays have seen. [D14]
+        Eq. 5 is linear in M: M = 1 costs a pixel its intensity and GPL and saves it its error. As a
+        sigmoid hardly moves at 0 or 1, price times M is minimised through its logistic surrogate:
+        the same sign, so the same optimum, but a slope that never vanishes. Errors are averaged
+        over 3x3 pixels first: a person is a blob, a misplaced edge is a line."""
+        cfg, logits = self.cfg, self.mask_logits(pick)  # (B,1,h,w)
+        self.logits[pick] = logits.detach()
+        error, edge = self.seen[pick].split(1, 1)  # (B,1,h,w)
+        known = (error >= 0).float()  # (B,1,h,w)
+        error = blur(error * known) / blur(known).clamp(min=0.1)  # (B,1,h,w)
+        price = cfg.lam_mask + 2 * self.level + cfg.lam_gpl * edge - error  # (B,1,h,w) [D7]
+        slope = F.softplus(torch.where(price > 0, logits, -logits))  # (B,1,h,w)
+        pull = cfg.lam_bimodal * bimodality(logits.sigmoid())
+        return (price.abs() * slope * known).mean() + pull
+
+    def mask_logits(self, pick: Tensor) -> Tensor:
+        """What the mask network says (B,1,h,w) to photos (B,)."""
+        return self.cgnet(self.scene.thumbs[pick].float() / 255)
+
+    def mask_of(self, rays: Rays, pick: Tensor) -> Tensor:
+        """M (R,) of rays, R / B from each of photos pick (B,)."""
+        if not self.use_mask:
+            return torch.zeros_like(rays.near)
+        return mask_at(self.mask_logits(pick), rays.uv)
 
     @torch.no_grad()
     def refresh_cache(self, part: int, parts: int) -> None:
@@ -889,92 +892,250 @@ class GeoNVS(nn.Module):
             x = torch.cartesian_prod(line[i:i + 1], line, line)  # (n^2,3)
             self.cache[0, 0, i] = self.sdf(x)[0].reshape(n, n)
 
-    def maintain(self, step: int) -> None:
-        """What happens between steps: an eighth of the cache is refreshed every eight steps."""
-        self.step = step
+    @torch.no_grad()
+    def refine(self, optimizer: torch.optim.Optimizer) -> None:
+        """Fits the octree to the scene: no fine cell far from the surface or where pictures agree.
+        A cell of level >= 1 stays split while the surface is within a cell of it; worst cells there
+        are newly split, up to cfg.max_mb. Adam's moments move with their features."""
+        octree, keys = self.sdf.octree, list(self.sdf.octree.split_keys)
+        hits = self.hits[self.hits[:, 0] < 2]  # (P,4) without the slots that no ray has filled
+        for level in range(1, octree.levels - 1):
+            s = torch.cat([self.sdf(x)[0] for x in octree.centres(level).split(CHUNK)])  # (N,)
+            is_close = s.abs() < (math.sqrt(3) / 2 + 1) * octree.cell(level)  # (N,)
+            close = octree.key(octree.cells[level][is_close], level)
+            worst = worst_cells(octree, level, hits, self.cfg.split_error)  # (Q,3)
+            new = octree.key(worst, level)
+            new = new[torch.isin(new, close) & ~torch.isin(new, keys[level])]
+            room = int(max(0, self.cfg.max_mb * 2 ** 20 - octree.bytes()) // SPLIT_BYTES)
+            keys[level] = torch.cat([keys[level][torch.isin(keys[level], close)], new[:room]])
+        old = octree.features
+        old_row = octree.build(keys)
+        moments = optimizer.state.pop(old).items()
+        optimizer.state[octree.features] = {k: v[old_row] if v.dim() else v for k, v in moments}
+        for group in optimizer.param_groups:
+            group["params"] = [octree.features if p is old else p for p in group["params"]]
+
+    def maintain(self, step: int, progress: float, optimizer: torch.optim.Optimizer) -> None:
+        """Cache slices are refreshed; a few times, the model is fitted to the scene."""
+        self.step = step + 1
         if step % 8 == 0:
             self.refresh_cache(step // 8 % 8, 8)
-
-    def mask_of(self, pick: Tensor, uv: Tensor, fresh: bool = True) -> Tensor:
-        """M (R,) of rays at uv (R,2) in photos pick (B,), from the network or from its last logits."""
-        if fresh:
-            logits = self.cgnet(self.scene.thumbs[pick].float() / 255)  # (B,1,h,w)
-            self.logits[pick] = logits.detach()
-        return mask_at(logits if fresh else self.logits[pick], uv)
-
-    def losses(self, rays: Rays, pick: Tensor, progress: float, gen: torch.Generator):
-        """The objective, Eq. 5. Returns its weighted sum, raw terms and health signals by name."""
-        cfg, R = self.cfg, len(rays.o)
-        jitter = torch.rand(R, cfg.samples + cfg.bg_samples, generator=gen, device=rays.o.device)
-        out = render_rays(self, rays, self.appearance(rays.img), jitter)
-        error = (out["rgb"] - rays.rgb).abs().mean(1)  # (R,) L1
-        masked = self.use_mask and progress > 0.1
-        fresh = self.step % cfg.mask_every == 0
-        mask = self.mask_of(pick, rays.uv, fresh) if masked else torch.zeros_like(error)  # (R,)
-        aux = torch.cat([random_ball(R // 2, gen), self.sfm[torch.randint(
-            max(len(self.sfm), 1), (R // 2 * (len(self.sfm) > 0),), generator=gen, device=mask.device)]])
-        s = self.sdf(aux)[0]  # (R/2 + R/2,)
-        raw = dict(rgb=((1 - mask) * error).mean(),
-                   eik=(out["eikonal"].mean(1) * out["hit"]).sum() / out["hit"].sum().clamp(min=1),
-                   curv=out["e_curv"].mean(),  # [D4]
-                   lps=torch.log(self.color.bounds()).sum(),  # [D5]
-                   off=torch.exp(-50 * s[:R // 2].abs()).mean(),
-                   sfm=s[R // 2:].abs().sum() / max(R // 2, 1))  # [D10]
-        total = (raw["rgb"] + cfg.lam_eik * raw["eik"] + cfg.lam_curv * raw["curv"]
-                 + cfg.lam_lps * raw["lps"] + cfg.lam_off * raw["off"] + cfg.lam_sfm * raw["sfm"])
-        if masked:
-            calibration = self.calibration if cfg.gpl == "calibrated" else None
-            calibrate(cfg.lam_grad * out["e_grad"] + cfg.lam_lap * out["e_curv"], self.calibration)
-            edge = edge_indicator(out["e_grad"], out["e_curv"], cfg.lam_grad, cfg.lam_lap, calibration)
-            raw["mask"] = mask_loss(mask, cfg.lam_bimodal)
-            raw["gpl"] = gpl_loss(mask, edge * out["opacity"].detach())
-            lam = cfg.lam_mask * (1 + 7 * math.exp(-30 * (progress - 0.1)))  # [D7]
-            total = total + lam * raw["mask"] + cfg.lam_gpl * raw["gpl"]
-        health = dict(zeta=self.deviation(), mask=mask.mean(), opacity=out["opacity"].mean(),
-                      miss=1 - out["hit"].float().mean(), mse=((out["rgb"] - rays.rgb) ** 2).mean())
-        return total, {k: v.detach() for k, v in (raw | health).items()}
+        if self.refined == len(REFINE_AT) or progress < REFINE_AT[self.refined]:
+            return
+        if self.cfg.grid == "octree":
+            self.refine(optimizer)
+        self.refined += 1
+        if self.refined == len(REFINE_AT) and self.cfg.mask == "auto" and self.use_mask:
+            share = self.logits[~self.scene.is_test].sigmoid().mean().item()
+            self.use_mask = share > 0.002
+            print(f"  mean mask {share:.4f}: mask {'stays on' if self.use_mask else 'goes off'}")
 
     def render(self, rays: Rays, code: Tensor) -> dict[str, Tensor]:
         """render_rays without jitter, for pictures and for fitting codes."""
-        jitter = torch.full((len(rays.o), self.cfg.samples + self.cfg.bg_samples), 0.5, device=rays.o.device)
+        shape = len(rays.o), self.cfg.samples + self.cfg.bg_samples
+        jitter = rays.o.new_full(shape, 0.5)  # (R,S+B)
         return render_rays(self, rays, code, jitter)
 
 
-# ---------------------------------------------------------------------------------------------------
-# 9 Energy meter
-# ---------------------------------------------------------------------------------------------------
+# ---- 8 The paper's two baselines, under the same loop, protocol and meter ------------------------
+
+
+def positional(x: Tensor, octaves: int) -> Tensor:
+    """x (...,n) with sines and cosines of 2^k x: (...,n(1+2 octaves)) (NeRF Eq. 4, no pi)."""
+    angle = (x[..., None] * 2.0 ** torch.arange(octaves, device=x.device)).flatten(-2)
+    return torch.cat([x, angle.sin(), angle.cos()], -1)
+
+
+def mlp(*sizes: int) -> nn.Sequential:
+    """Linear layers with ReLU between them and after the last."""
+    pairs = zip(sizes, sizes[1:])
+    return nn.Sequential(*[m for a, b in pairs for m in (nn.Linear(a, b), nn.ReLU())])
+
+
+def summed(raw: dict[str, Tensor], **health: Tensor) -> tuple[Tensor, dict]:
+    """The sum of loss terms, and every figure by name."""
+    return sum(raw.values()), {k: v.detach() for k, v in (raw | health).items()}
+
+
+class RadianceField(nn.Module):
+    """NeRF's network: 8 layers with a skip to the fifth, density, then colour."""
+    def __init__(self, width: int, code_dim: int):
+        super().__init__()
+        self.first, self.second = mlp(93, *[width] * 4), mlp(93 + width, *[width] * 4)
+        self.density, self.bottleneck = nn.Linear(width, 1), nn.Linear(width, width)
+        self.color = nn.Sequential(mlp(width + 27 + code_dim, width // 2), nn.Linear(width // 2, 3))
+
+    def forward(self, x: Tensor, d: Tensor, code: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Density (R,S), colour (R,S,3), bottleneck (R,S,W) at x (R,S,3), d (R,3), code (R,A)."""
+        pe = positional(x, 15)  # (R,S,93)
+        h = self.second(torch.cat([pe, self.first(pe)], 2))  # (R,S,W)
+        per_ray = torch.cat([positional(d, 4), code], 1)[:, None].expand(-1, x.shape[1], -1)
+        neck = self.bottleneck(h)  # (R,S,W)
+        rgb = torch.sigmoid(self.color(torch.cat([neck, per_ray], 2)))  # (R,S,3)
+        return F.softplus(self.density(h)[..., 0]), rgb, neck
+
+
+class NeRFW(Method):
+    """NeRF-W (Martin-Brualla et al. 2021): appearance codes, transient head with uncertainty. From
+    the paper: two networks, 48 + 16 code dims, losses, lambda_u = 0.01. From its PyTorch version:
+    width 256, 64 + 64 samples, beta_min 0.03, Adam 5e-4, 1024 rays, SfM near and far."""
+
+    code_dim, use_mask = 48, True
+
+    def __init__(self, cfg: Config, scene: Scene, gen: torch.Generator):
+        super().__init__()
+        self.cfg, self.scene = cfg, scene
+        self.coarse, self.fine = (RadianceField(cfg.hidden, self.code_dim) for _ in range(2))
+        points = scene.points[::20] if len(scene.points) else scene.c2w.new_zeros(1, 3)
+        reach = (points - scene.c2w[:, None, :, 3]).norm(dim=2)  # (I,K/20)
+        is_small = reach.numel() < 1e7  # what torch.quantile takes
+        self.far = float(reach.flatten().double().quantile(0.999) if is_small else reach.max())
+        self.make_heads(len(scene.wh))
+        self.to(scene.rgb.device)
+
+    def make_heads(self, photos: int) -> None:
+        half = self.cfg.hidden // 2
+        self.appearance = nn.Embedding(photos, self.code_dim)
+        self.transient = nn.Embedding(photos, 16)
+        self.head, self.head_out = mlp(self.cfg.hidden + 16, *[half] * 4), nn.Linear(half, 5)
+
+    def groups(self) -> list[dict]:
+        return [dict(params=list(self.parameters()), lr=self.cfg.lr_net)]
+
+    def render(self, rays: Rays, code: Tensor, jitter: Tensor | None = None,
+               transient: Tensor | None = None) -> dict[str, Tensor]:
+        """Coarse and fine pass. transient: (R,16) codes of the transient head, or None."""
+        n, R, dev = self.cfg.samples, len(rays.o), code.device
+        u = torch.full((R, 2 * n), 0.5, device=dev) if jitter is None else jitter
+        u = (torch.arange(n, device=dev).repeat(2) + u) / n  # (R,2n) stratified twice
+        edges = torch.linspace(0, 1, n + 1, device=dev)
+        edges = rays.near[:, None] + (self.far - rays.near)[:, None] * edges  # (R,n+1)
+        t = inverse_cdf(edges, torch.ones_like(edges[:, 1:]), u[:, :n])  # (R,n)
+        out = self.pass_through(self.coarse, rays, t, code, None)
+        more = inverse_cdf(edges, out["w"].detach() + 1e-3, u[:, n:])  # (R,n)
+        t = torch.cat([t, more], 1).sort(1)[0]  # (R,2n)
+        return self.pass_through(self.fine, rays, t, code, transient) | dict(coarse=out["rgb"])
+
+    def pass_through(self, field: RadianceField, rays: Rays, t: Tensor, code: Tensor,
+                     transient: Tensor | None) -> dict[str, Tensor]:
+        """Densities to a picture: C = sum T (alpha_s c_s + alpha_t c_t) (NeRF-W Eq. 5)."""
+        sigma, rgb, neck = field(rays.at(t), rays.d, code)  # (R,S), (R,S,3), (R,S,W)
+        dt = F.pad(torch.diff(t), (0, 1), value=100.0)  # (R,S), last opaque
+        alpha = 1 - torch.exp(-sigma * dt)  # (R,S)
+        if transient is None:
+            w, _ = composite(alpha)  # (R,S)
+            return dict(rgb=(w[..., None] * rgb).sum(1), depth=(w * t).sum(1), w=w)
+        code_t = transient[:, None].expand(-1, t.shape[1], -1)  # (R,S,16)
+        h = self.head_out(self.head(torch.cat([neck, code_t], 2)))  # (R,S,5)
+        sigma_t, beta = F.softplus(h[..., 0]), F.softplus(h[..., 4])  # (R,S)
+        alpha_t = 1 - torch.exp(-sigma_t * dt)  # (R,S)
+        w, _ = composite(1 - torch.exp(-(sigma + sigma_t) * dt))  # (R,S)
+        before = w / (1 - torch.exp(-(sigma + sigma_t) * dt)).clamp(min=1e-10)  # (R,S) T
+        mixed = alpha[..., None] * rgb + alpha_t[..., None] * torch.sigmoid(h[..., 1:4])  # (R,S,3)
+        return dict(rgb=(before[..., None] * mixed).sum(1), depth=(w * t).sum(1), w=w,
+                    beta=(before * alpha_t * beta).sum(1) + 0.03, sigma_t=sigma_t.mean(1),
+                    transient=(before * alpha_t).sum(1))
+
+    def losses(self, rays: Rays, pick: Tensor, progress: float, gen: torch.Generator):
+        """NeRF-W Eq. 13: squared error over learned variance, its log, a price on transients."""
+        jitter = torch.rand(len(rays.o), 2 * self.cfg.samples, generator=gen, device=rays.o.device)
+        out = self.render(rays, self.codes()[rays.img], jitter, self.transient(rays.img))
+        error = ((out["rgb"] - rays.rgb) ** 2).sum(1)  # (R,)
+        raw = dict(coarse=((out["coarse"] - rays.rgb) ** 2).mean() / 2,
+                   rgb=(error / (2 * out["beta"] ** 2)).mean(),
+                   beta=3 + torch.log(out["beta"]).mean(), sigma=0.01 * out["sigma_t"].mean())
+        return summed(raw, mask=out["transient"].mean(), mse=error.mean() / 3)
+
+    def mask_of(self, rays: Rays, pick: Tensor) -> Tensor:
+        """Opacity (R,) of the transient part."""
+        codes = self.codes()[rays.img], None, self.transient(rays.img)
+        return self.render(rays, *codes)["transient"]
+
+
+class HaNeRF(NeRFW):
+    """Ha-NeRF (Chen et al. 2022): appearance from a CNN over the photo, mask by an MLP of pixels.
+    From the authors' code: network sizes, 64 + 64 samples, one 32x32 grid of rays per step, loss
+    weights, Adam 5e-4. Left out: the mode-seeking term (weight 1e-6)."""
+    def make_heads(self, photos: int) -> None:
+        sizes = [(3, 64, 7, 1), (64, 128, 4, 2), *[(a, 256, 4, 2) for a in (128, 256, 256)]]
+        convs = [m for a, b, k, s in sizes for m in (
+            nn.Conv2d(a, b, k, s, (k - 1) // 2, padding_mode="reflect"), nn.ReLU())]
+        self.encoder = nn.Sequential(*convs, nn.AdaptiveAvgPool2d(1),
+                                     nn.Conv2d(256, self.code_dim, 1), nn.Flatten())
+        self.mask_code = nn.Embedding(photos, 128)
+        self.mask_mlp = nn.Sequential(mlp(128 + 42, *[256] * 4), nn.Linear(256, 1), nn.Sigmoid())
+
+    def encode(self, pick: Tensor) -> Tensor:
+        """Codes (B,A) of photos (B,)."""
+        return self.encoder(self.scene.thumbs[pick].float() / 127.5 - 1)
+
+    @torch.no_grad()
+    def codes(self) -> Tensor:
+        photos = torch.arange(len(self.scene.wh), device=self.scene.wh.device)
+        return torch.cat([self.encode(pick) for pick in photos.split(8)])
+
+    def batch(self, photos: Tensor, gen: torch.Generator) -> tuple[Rays, Tensor]:
+        """A square grid of rays over a random window of one photo."""
+        pick = photos[torch.randint(len(photos), (1,), generator=gen, device=photos.device)]
+        zoom = torch.rand(1, generator=gen, device=photos.device)
+        size = 0.5 + 0.5 * zoom
+        corner = torch.rand(2, generator=gen, device=photos.device) * (1 - size)
+        grid = torch.linspace(0, 1, math.isqrt(self.cfg.rays), device=photos.device)
+        uv = torch.cartesian_prod(grid, grid).flip(1) * size + corner  # (R,2)
+        w, h = self.scene.wh[pick[0]]
+        pixel = (uv[:, 1] * (h - 1)).round().long() * w + (uv[:, 0] * (w - 1)).round().long()
+        return make_rays(self.scene, pick.expand(len(pixel)), pixel), pick
+
+    def losses(self, rays: Rays, pick: Tensor, progress: float, gen: torch.Generator):
+        """Ha-NeRF Eq. 9: masked colour, a falling price on masks, codes that survive a render."""
+        R, side = len(rays.o), math.isqrt(self.cfg.rays)
+        jitter = torch.rand(R, 2 * self.cfg.samples, generator=gen, device=rays.o.device)
+        code = self.encode(pick)  # (1,A)
+        out = self.render(rays, code.expand(R, -1), jitter)
+        mask = self.mask_of(rays, pick)  # (R,)
+        error, coarse = (((out[k] - rays.rgb) ** 2).mean(1) for k in ("rgb", "coarse"))  # (R,)
+        window = out["rgb"].reshape(1, side, side, 3).permute(0, 3, 1, 2)
+        again = self.encoder(window * 2 - 1)  # (1,A)
+        price = max(6e-3, 5e-2 * math.exp(-1e-3 * self.cfg.steps * progress))
+        raw = dict(rgb=((1 - mask) * error).mean() / 2,
+                   coarse=((1 - mask.detach()) * coarse).mean() / 2,
+                   size=price * (mask ** 2).mean(), code=1e-5 * (code ** 2).mean(),
+                   again=1e-3 * (again - code.detach()).abs().mean())
+        return summed(raw, mask=mask.mean(), mse=error.mean())
+
+    def mask_of(self, rays: Rays, pick: Tensor) -> Tensor:
+        per_ray = torch.cat([self.mask_code(rays.img), positional(rays.uv, 10)], 1)
+        return self.mask_mlp(per_ray)[:, 0]
+
+
+# ---- 9 Energy meter ------------------------------------------------------------------------------
 
 
 class EnergyMeter:
-    """Joules spent between start() and stop(), from an energy counter and from power samples.
-
-    counter() returns joules and may wrap at `wrap`; power() returns watts and is integrated by the
-    trapezoid rule every `period` seconds. Either may be None; without both, the energy is None and
-    never 0. Windows add up, so evaluation can be left out and a resumed run goes on counting.
-    """
-
-    def __init__(self, source=None, counter=None, power=None, wrap=math.inf, period=0.5, clock=time.monotonic):
+    """Joules between start() and stop(), by an energy counter and by integrated power samples.
+    counter() returns joules and may wrap at `wrap`; power() returns watts, integrated by the
+    trapezoid rule every `period` seconds. Without either the energy is None, never 0. Windows add
+    up: evaluation can be left out, and a resumed run goes on counting."""
+    def __init__(self, source=None, counter=None, power=None, wrap=math.inf, period=0.5,
+                 clock=time.monotonic):
         self.source, self.counter, self.power, self.wrap = source, counter, power, wrap
-        self.period, self.clock = period, clock
-        self.joules = 0.0 if counter else None
-        self.sampled_joules = 0.0 if power else None
+        self.period, self.clock, self.lock = period, clock, threading.Lock()
+        self.joules, self.sampled_joules = 0.0 if counter else None, 0.0 if power else None
         self.idle_w = power() if power else None  # read before any work
-        self.lock, self.stopped, self.thread = threading.Lock(), threading.Event(), None
 
     def tick(self) -> None:
         """Adds what was spent since the last tick."""
         with self.lock:
-            now = (self.clock(), self.counter() if self.counter else 0.0, self.power() if self.power else 0.0)
-            if self.last is not None and self.counter:
+            now = self.clock(), self.counter and self.counter(), self.power and self.power()
+            if self.last and self.joules is not None:
                 self.joules += (now[1] - self.last[1]) % self.wrap
-            if self.last is not None and self.power:
+            if self.last and self.sampled_joules is not None:
                 self.sampled_joules += (now[2] + self.last[2]) / 2 * (now[0] - self.last[0])
             self.last = now
 
     def start(self) -> None:
-        self.last = None
+        self.last, self.stopped = None, threading.Event()
         self.tick()
-        self.stopped.clear()
         self.thread = threading.Thread(target=self.run, daemon=True)
         self.thread.start()
 
@@ -983,40 +1144,38 @@ class EnergyMeter:
             self.tick()
 
     def stop(self) -> None:
-        if self.thread is not None:
-            self.stopped.set()
-            self.thread.join()
-            self.thread = None
-            self.tick()
+        self.stopped.set()
+        self.thread.join()
+        self.tick()
 
     def report(self) -> dict:
-        """Watt-hours by counter and by samples (None where there is no such reading) and their source."""
-        counter = None if self.joules is None else self.joules / 3600
-        sampled = None if self.sampled_joules is None else self.sampled_joules / 3600
-        off = abs(counter / sampled - 1) if counter and sampled else None
-        return dict(energy_wh=counter if counter is not None else sampled, energy_wh_sampled=sampled,
-                    energy_source=self.source, idle_w=self.idle_w, energy_disagree=None if off is None else off > 0.05)
+        """Watt-hours by counter, else by samples; None where there is neither."""
+        joules = self.joules, self.sampled_joules
+        counter, sampled = (None if j is None else j / 3600 for j in joules)
+        off = abs(counter / sampled - 1) > 0.05 if counter and sampled else None
+        return dict(energy_wh=sampled if counter is None else counter, energy_wh_sampled=sampled,
+                    energy_source=self.source, energy_disagrees=off, idle_w=self.idle_w)
 
 
 def rapl_meter(root: str = "/sys/class/powercap") -> EnergyMeter:
-    """Processor packages through RAPL where readable (often root only), else a meter that reads None."""
-    packages = [p for p in sorted(Path(root).glob("intel-rapl:*")) if p.name.count(":") == 1
-                and os.access(p / "energy_uj", os.R_OK)]
-    if not packages:
-        return EnergyMeter()
-    wraps = [int((p / "max_energy_range_uj").read_text()) for p in packages]
-    total, last = [0] * len(packages), [int((p / "energy_uj").read_text()) for p in packages]
+    """Processor packages through RAPL where readable (often by root only), or None."""
+    packages = [p for p in sorted(Path(root).glob("intel-rapl:*"))
+                if p.name.count(":") == 1 and os.access(p / "energy_uj", os.R_OK)]
 
-    def counter():
-        for i, p in enumerate(packages):  # each package wraps on its own
-            now = int((p / "energy_uj").read_text())
-            total[i], last[i] = total[i] + (now - last[i]) % wraps[i], now
-        return sum(total) / 1e6
-    return EnergyMeter("rapl", counter)
+    def read(name):
+        return [int((p / name).read_text()) for p in packages]
+    wraps, last, total = read("max_energy_range_uj"), read("energy_uj"), 0
+
+    def counter():  # each package wraps on its own
+        nonlocal last, total
+        now = read("energy_uj")
+        total, last = total + sum((b - a) % w for a, b, w in zip(last, now, wraps)), now
+        return total / 1e6
+    return EnergyMeter("rapl", counter) if packages else EnergyMeter()
 
 
 def make_meter(device: torch.device) -> EnergyMeter:
-    """The meter for a device: NVML (the GPU that torch uses, found by UUID), RAPL, or none."""
+    """NVML for a GPU, found by UUID whatever CUDA_VISIBLE_DEVICES says; RAPL for a CPU; or none."""
     if device.type != "cuda":
         return rapl_meter()
     try:
@@ -1025,21 +1184,23 @@ def make_meter(device: torch.device) -> EnergyMeter:
         print("  no GPU energy: pip install nvidia-ml-py")
         return EnergyMeter()
     pynvml.nvmlInit()
-    uuid = f"GPU-{torch.cuda.get_device_properties(device).uuid}"  # whatever CUDA_VISIBLE_DEVICES says
-    gpu = pynvml.nvmlDeviceGetHandleByUUID(uuid.encode())
+    uuid = torch.cuda.get_device_properties(device).uuid
+    gpu = pynvml.nvmlDeviceGetHandleByUUID(f"GPU-{uuid}")
     return EnergyMeter("nvml", lambda: pynvml.nvmlDeviceGetTotalEnergyConsumption(gpu) / 1e3,
                        lambda: pynvml.nvmlDeviceGetPowerUsage(gpu) / 1e3)
 
 
-# ---------------------------------------------------------------------------------------------------
-# 10 Training
-# ---------------------------------------------------------------------------------------------------
+# ---- 10 Training ---------------------------------------------------------------------------------
 
-METHODS = {"geonvsw": GeoNVS}
+METHODS = {  # and the published settings of the baselines
+    "geonvsw": (GeoNVS, {}),
+    "nerfw": (NeRFW, dict(rays=1024, photos=1024, samples=64, hidden=256, lr_net=5e-4)),
+    "hanerf": (HaNeRF, dict(rays=1024, photos=1, samples=64, hidden=256, lr_net=5e-4)),
+}
 CHECKPOINT_S = 60.0  # seconds of training between checkpoints
 
 
-def make_optimizer(model) -> torch.optim.Adam:
+def make_optimizer(model: Method) -> torch.optim.Adam:
     optimizer = torch.optim.Adam(model.groups(), betas=(0.9, 0.99), eps=1e-15, fused=True)
     for group in optimizer.param_groups:
         group["base_lr"] = group["lr"]
@@ -1053,7 +1214,11 @@ def set_learning_rate(optimizer, step: int, progress: float) -> None:
         group["lr"] = group["base_lr"] * factor
 
 
-def save_checkpoint(path: Path, cfg: Config, model, optimizer, gen: torch.Generator, state: dict) -> None:
+def write_text(path: Path, text: str) -> None:
+    atomic_write(path, lambda tmp: Path(tmp).write_text(text))
+
+
+def save_checkpoint(path: Path, cfg: Config, model, optimizer, gen, state: dict) -> None:
     atomic_write(path, lambda tmp: torch.save(dict(
         geonvs=1, config=asdict(cfg), model=model.state_dict(), optimizer=optimizer.state_dict(),
         octrees=[o.split_keys for o in model.octrees()], rng=gen.get_state(), state=state), tmp))
@@ -1068,13 +1233,14 @@ def read_checkpoint(path: Path, device="cpu") -> dict:
     except Exception as error:  # a damaged file can fail in any layer: zip, pickle, tensor storage
         raise UserError(f"{path} is damaged or not a checkpoint ({type(error).__name__}): "
                         "delete it and train again") from None
-    if not isinstance(saved, dict) or saved.get("geonvs") != 1:
+    known = {f.name for f in fields(Config)}
+    if not isinstance(saved, dict) or saved.get("geonvs") != 1 or set(saved.get("config", ())) != known:
         raise UserError(f"{path} is not a checkpoint of this program: delete it and train again")
     return saved
 
 
 def restore(saved: dict, path: Path, model, optimizer, gen: torch.Generator) -> dict:
-    """Puts a checkpoint's dictionary back into model, optimiser and generator; returns its state."""
+    """Puts a checkpoint back into model, optimiser and generator; returns its state."""
     try:
         for octree, keys in zip(model.octrees(), saved["octrees"], strict=True):
             octree.build(keys)
@@ -1085,37 +1251,54 @@ def restore(saved: dict, path: Path, model, optimizer, gen: torch.Generator) -> 
             optimizer.load_state_dict(saved["optimizer"])
             gen.set_state(saved["rng"].cpu())
         return saved["state"]
-    except (KeyError, ValueError, RuntimeError, TypeError, AttributeError) as error:
+    except (KeyError, IndexError, ValueError, RuntimeError, TypeError, AttributeError) as error:
         raise UserError(f"{path} does not fit this scene and these settings "
-                        f"({str(error).splitlines()[0][:90]}): delete it or use the flags it was made with") from None
+                        f"({str(error).splitlines()[0][:90]}): delete it or use the flags it was "
+                        "made with") from None
+
+
+def training_step(model: Method, optimizer, photos: Tensor, state: dict, progress: float,
+                  gen: torch.Generator) -> tuple[dict, Tensor]:
+    """One update. Returns the logs, and 1 if a loss or gradient that is not finite made it void."""
+    cfg, device = model.cfg, photos.device
+    rays, pick = model.batch(photos, gen)
+    with torch.autocast(device.type, torch.bfloat16, enabled=cfg.amp and device.type == "cuda"):
+        loss, logs = model.losses(rays, pick, progress, gen)
+    optimizer.zero_grad()
+    loss.backward()
+    set_learning_rate(optimizer, state["step"], progress)
+    parameters = [p for group in optimizer.param_groups for p in group["params"]]
+    norm = nn.utils.get_total_norm([p.grad for p in parameters if p.grad is not None])
+    optimizer.found_inf = (~torch.isfinite(norm + loss.detach())).float()
+    optimizer.step()
+    model.maintain(state["step"], progress, optimizer)
+    state["step"] += 1
+    return logs, optimizer.found_inf.long()
 
 
 def train(cfg: Config, scene: Scene, run: Path, saved: dict | None = None):
-    """Trains until cfg.steps or cfg.minutes; writes log.jsonl and checkpoint.pt below run.
-
-    saved: a checkpoint to go on from. Returns (model, state); state has step, seconds, joules, curve.
-    Evaluation moments are outside the timed and metered window.
-    """
+    """Trains until cfg.steps or cfg.minutes; writes log.jsonl and checkpoint.pt below run. saved: a
+    checkpoint to go on from. Returns model, state (step, seconds, joules, curve), meter. Evaluation
+    moments are outside the timed and metered window."""
     device = scene.rgb.device
     torch.set_flush_denormal(True)  # vanishing weights would otherwise slow a CPU down
     torch.manual_seed(cfg.seed)
     gen = torch.Generator(device).manual_seed(cfg.seed)
-    model = METHODS[cfg.method](cfg, scene, gen)
-    optimizer = make_optimizer(model)
-    meter = make_meter(device)
+    model = METHODS[cfg.method][0](cfg, scene, gen)
+    optimizer, meter = make_optimizer(model), make_meter(device)
     state = dict(step=0, seconds=0.0, joules=None, sampled_joules=None, dropped=0, curve=[])
     checkpoint, log_path = run / "checkpoint.pt", run / "log.jsonl"
-    if saved is None:
-        log_path.unlink(missing_ok=True)
-    else:
+    lines = []
+    if saved is not None:
         state = restore(saved, checkpoint, model, optimizer, gen)
-        meter.joules, meter.sampled_joules = state["joules"], state["sampled_joules"]
-        kept = [l for l in log_path.read_text().splitlines() if json.loads(l)["step"] <= state["step"]]
-        atomic_write(log_path, lambda tmp: Path(tmp).write_text("".join(l + "\n" for l in kept)))
-    photos = torch.nonzero(~scene.is_test)[:, 0]  # (B,)
+        meter.joules = state["joules"] if meter.counter else None  # all of it was measured, or None
+        meter.sampled_joules = state["sampled_joules"] if meter.power else None
+        if log_path.exists():
+            lines = [k for k in log_path.read_text().splitlines(keepends=True) if k.endswith("\n")]
+    write_text(log_path, "".join(k for k in lines if json.loads(k)["step"] <= state["step"]))
+    photos, held_out, codes = scene.photos(False), scene.photos(True), None  # (B,)
     dropped = torch.tensor(state["dropped"], device=device)
     last_save = last_line = since = time.perf_counter()
-    next_check = 2.0 ** math.ceil(math.log2(max(state["seconds"], 4)))
     meter.start()
     if saved is None:
         model.start(gen)
@@ -1128,35 +1311,31 @@ def train(cfg: Config, scene: Scene, run: Path, saved: dict | None = None):
         save_checkpoint(checkpoint, cfg, model, optimizer, gen, state | dict(seconds=clock()))
     try:
         while state["step"] < cfg.steps and not (cfg.minutes and clock() >= 60 * cfg.minutes):
-            step, before = state["step"], time.perf_counter()
-            progress = max(step / cfg.steps, clock() / (60 * cfg.minutes) if cfg.minutes else 0)
-            rays, pick = random_rays(scene, photos, cfg.rays, cfg.photos, gen)
-            with torch.autocast(device.type, torch.bfloat16, enabled=cfg.amp and device.type == "cuda"):
-                loss, logs = model.losses(rays, pick, progress, gen)
-            optimizer.zero_grad()
-            loss.backward()
-            set_learning_rate(optimizer, step, progress)
-            norm = nn.utils.get_total_norm([p.grad for g in optimizer.param_groups for p in g["params"]
-                                            if p.grad is not None])
-            optimizer.found_inf = (~torch.isfinite(norm + loss.detach())).float()  # drops the step
-            dropped += optimizer.found_inf.long()
-            optimizer.step()
-            model.maintain(step)
-            state["step"] = step + 1
-            now = time.perf_counter()
-            if now - last_line > 5 or step + 1 == cfg.steps:
-                last_line = now
+            spent = clock() / (60 * cfg.minutes) if cfg.minutes else 0
+            progress = max(state["step"] / cfg.steps, spent)
+            logs, is_dropped = training_step(model, optimizer, photos, state, progress, gen)
+            dropped += is_dropped
+            if cfg.curve and len(held_out) and clock() > 4 * 1.5 ** len(state["curve"]):
+                state["seconds"] = clock()
+                meter.stop()  # looking costs neither time nor energy
+                codes, value = validate(model, scene, held_out, codes)
+                state["curve"].append(dict(step=state["step"], seconds=state["seconds"], psnr=value,
+                                           wh=meter.report()["energy_wh"]))
+                meter.start()
+                since = time.perf_counter()
+            if time.perf_counter() - last_line > 5 or state["step"] == cfg.steps:
+                last_line = time.perf_counter()
                 report_line(cfg, log_path, state["step"], clock(), progress, logs, int(dropped))
-            if now - last_save > CHECKPOINT_S:
+            if time.perf_counter() - last_save > CHECKPOINT_S:
                 save()
                 last_save = time.perf_counter()
-        meter.stop()
-        save()
-        state["seconds"] = clock()
     except KeyboardInterrupt:
         meter.stop()
         save()
-        raise UserError(f"stopped at step {state['step']}; the same command with --resume goes on") from None
+        raise UserError(f"stopped at step {state['step']}; add --resume to go on") from None
+    meter.stop()
+    save()
+    state["seconds"] = clock()
     return model, state, meter
 
 
@@ -1165,15 +1344,13 @@ def report_line(cfg, log_path, step, seconds, progress, logs, dropped) -> None:
     values = {k: float(v) for k, v in logs.items()}
     values["psnr"] = -10 * math.log10(max(values.pop("mse"), 1e-10))
     rate, left = step * cfg.rays / seconds, seconds / max(progress, 1e-3) * (1 - progress)
-    print(f"  step {step:6d}  psnr {values['psnr']:5.2f}  zeta {values.get('zeta', math.nan):6.1f}  "
-          f"mask {values['mask']:.3f}  {rate:8.0f} rays/s  {left / 60:5.1f} min left", flush=True)
+    print(f"  step {step:6d}  psnr {values['psnr']:5.2f}  zeta {values.get('zeta', math.nan):6.1f} "
+          f" mask {values['mask']:.3f}  {rate:8.0f} rays/s  {left / 60:5.1f} min left", flush=True)
     with open(log_path, "a") as file:
         file.write(json.dumps(dict(step=step, seconds=seconds, dropped=dropped) | values) + "\n")
 
 
-# ---------------------------------------------------------------------------------------------------
-# 11 Scoring, mesh, pictures
-# ---------------------------------------------------------------------------------------------------
+# ---- 11 Scoring, mesh, pictures ------------------------------------------------------------------
 
 
 def psnr(a: np.ndarray, b: np.ndarray) -> float:
@@ -1183,7 +1360,7 @@ def psnr(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def ssim(a: np.ndarray, b: np.ndarray) -> float | None:
-    """SSIM of two uint8 pictures: Gaussian window of 11 px, sigma 1.5, no border; None below 11 px."""
+    """SSIM of two uint8 pictures: Gaussian window of 11 px, sigma 1.5, no border, or None."""
     if min(a.shape[:2]) < 11:
         return None
     return float(structural_similarity(a, b, channel_axis=2, data_range=255, gaussian_weights=True,
@@ -1194,29 +1371,30 @@ class LPIPS(nn.Module):
     """Learned perceptual distance on AlexNet features, v0.1 weights (Zhang et al. 2018)."""
 
     TRUNK = "https://download.pytorch.org/models/alexnet-owt-7be5be79.pth"
-    HEADS = "https://raw.githubusercontent.com/richzhang/PerceptualSimilarity/master/lpips/weights/v0.1/alex.pth"
-    SHAPES = ((3, 64, 11, 4, 2), (64, 192, 5, 1, 2), (192, 384, 3, 1, 1), (384, 256, 3, 1, 1), (256, 256, 3, 1, 1))
+    HEADS = ("https://raw.githubusercontent.com/richzhang/PerceptualSimilarity/master/"
+             "lpips/weights/v0.1/alex.pth")
 
     def __init__(self):
         super().__init__()
-        self.convs = nn.ModuleList(nn.Conv2d(a, b, k, s, p) for a, b, k, s, p in self.SHAPES)
-        self.heads = nn.ParameterList(torch.zeros(1, b, 1, 1) for _, b, *_ in self.SHAPES)
+        sizes = ((3, 64, 11, 4, 2), (64, 192, 5, 1, 2), (192, 384, 3, 1, 1), (384, 256, 3, 1, 1),
+                 (256, 256, 3, 1, 1))
+        self.convs = nn.ModuleList(nn.Conv2d(*size) for size in sizes)
+        self.heads = nn.ParameterList(torch.zeros(1, size[1], 1, 1) for size in sizes)
 
     def load(self, trunk: dict, heads: dict) -> "LPIPS":
-        for i, (layer, index) in enumerate(zip(self.convs, (0, 3, 6, 8, 10))):
-            layer.load_state_dict({k: trunk[f"features.{index}.{k}"] for k in ("weight", "bias")})
+        for i, (layer, at) in enumerate(zip(self.convs, (0, 3, 6, 8, 10))):
+            layer.load_state_dict({k: trunk[f"features.{at}.{k}"] for k in ("weight", "bias")})
             self.heads[i].data.copy_(heads[f"lin{i}.model.1.weight"])
-        return self.requires_grad_(False)
+        return self
 
+    @torch.no_grad()
     def forward(self, a: Tensor, b: Tensor) -> Tensor:
         """Distance (B,) of pictures (B,3,H,W) in 0..1."""
-        x = torch.cat([a, b]) * 2 - 1
-        x = (x - x.new_tensor([-0.030, -0.088, -0.188])[:, None, None]) / x.new_tensor(
-            [0.458, 0.448, 0.450])[:, None, None]
-        total = 0
+        mean, std = a.new_tensor([[-0.030, -0.088, -0.188], [0.458, 0.448, 0.450]])[..., None, None]
+        x, total = (torch.cat([a, b]) * 2 - 1 - mean) / std, 0
         for i, (layer, head) in enumerate(zip(self.convs, self.heads)):
             x = F.relu(layer(F.max_pool2d(x, 3, 2) if i in (1, 2) else x))
-            fa, fb = (x / (x.pow(2).sum(1, keepdim=True).sqrt() + 1e-10)).chunk(2)
+            fa, fb = F.normalize(x, dim=1, eps=1e-10).chunk(2)
             total = total + ((fa - fb) ** 2 * head).sum(1).mean((1, 2))
         return total
 
@@ -1224,8 +1402,8 @@ class LPIPS(nn.Module):
 def make_lpips(device) -> LPIPS | None:
     """LPIPS with its published weights, or None with one line of reason where they can't be had."""
     try:
-        weights = [torch.hub.load_state_dict_from_url(url, map_location="cpu", weights_only=True, progress=False)
-                   for url in (LPIPS.TRUNK, LPIPS.HEADS)]
+        weights = [torch.hub.load_state_dict_from_url(url, map_location="cpu", progress=False,
+                   weights_only=True) for url in (LPIPS.TRUNK, LPIPS.HEADS)]
     except OSError as error:  # urllib's errors are OSErrors
         print(f"  lpips is null: its weights could not be downloaded ({error})")
         return None
@@ -1239,58 +1417,68 @@ def half_pixels(scene: Scene, photo: int, left: bool) -> Tensor:
     return pixel[(pixel % w < w // 2) == left]
 
 
+def pixels_of_each(allowed: list[Tensor], n: int, gen: torch.Generator) -> Tensor:
+    """n random pixel numbers from each photo's allowed ones, photo by photo: (Bn,)."""
+    dev = gen.device
+    return torch.cat([a[torch.randint(len(a), (n,), generator=gen, device=dev)] for a in allowed])
+
+
 def fit_codes(model, scene: Scene, photos: Tensor, codes: Tensor | None, steps: int, protocol: str,
               rays_per_photo: int = 64) -> Tensor:
     """Appearance codes (B,A) of unseen photos (B,): Adam on random rays of the left halves. [D12]
-
-    Starts from codes, or from the mean code of the training photos. The scene itself stays untouched.
-    """
-    gen = torch.Generator(scene.rgb.device).manual_seed(0)
+    Starts from codes, or from the mean code of the training photos. The scene stays untouched."""
+    gen, n = torch.Generator(scene.rgb.device).manual_seed(0), rays_per_photo
     if codes is None:
-        codes = model.appearance.weight[~scene.is_test].mean(0).expand(len(photos), -1)  # (B,A)
+        codes = model.codes()[~scene.is_test].mean(0).expand(len(photos), -1)  # (B,A)
     codes = codes.detach().clone().requires_grad_()
     if codes.numel() == 0:
         return codes
-    allowed = [torch.cat([half_pixels(scene, i, True)] + ([half_pixels(scene, i, False)]
-                         if protocol == "leaky" else [])) for i in photos.tolist()]
-    img = photos.repeat_interleave(rays_per_photo)  # (R,)
+    sides = (True, False) if protocol == "leaky" else (True,)
+    allowed = [torch.cat([half_pixels(scene, i, side) for side in sides]) for i in photos.tolist()]
+    img = photos.repeat_interleave(n)  # (R,)
     adam = torch.optim.Adam([codes], lr=0.1)
-    was = [p.requires_grad for p in model.parameters()]
+    trainable = [p for p in model.parameters() if p.requires_grad]
     model.requires_grad_(False)
     for step in range(steps):
         adam.param_groups[0]["lr"] = 0.1 * 0.1 ** (step / steps)
-        pixel = torch.cat([a[torch.randint(len(a), (rays_per_photo,), generator=gen, device=a.device)]
-                           for a in allowed])  # (R,)
-        rays = make_rays(scene, img, pixel)
-        loss = (model.render(rays, codes.repeat_interleave(rays_per_photo, 0))["rgb"] - rays.rgb).abs().mean()
+        rays = make_rays(scene, img, pixels_of_each(allowed, n, gen))
+        rgb = model.render(rays, codes.repeat_interleave(n, 0))["rgb"]  # (R,3)
         adam.zero_grad()
-        loss.backward()
+        (rgb - rays.rgb).abs().mean().backward()
         adam.step()
-    for parameter, flag in zip(model.parameters(), was):
-        parameter.requires_grad_(flag)
+    for parameter in trainable:
+        parameter.requires_grad_(True)
     return codes.detach()
 
 
-CHUNK = 4096  # rays rendered at once
+def validate(model, scene: Scene, photos: Tensor, codes: Tensor | None) -> tuple[Tensor, float]:
+    """Codes fitted a little further and PSNR, both on left halves of photos (B,): leaks nothing."""
+    codes = fit_codes(model, scene, photos, codes, 40, "half", 32)
+    gen = torch.Generator(scene.rgb.device).manual_seed(1)
+    pixel = pixels_of_each([half_pixels(scene, i, True) for i in photos.tolist()], 256, gen)
+    errors = []
+    for img, part, code in zip(photos, pixel.split(256), codes):
+        rays = make_rays(scene, img.expand(256), part)
+        with torch.no_grad():
+            rgb = model.render(rays, code.expand(256, -1))["rgb"]  # (256,3)
+        errors.append(((rgb - rays.rgb) ** 2).mean())
+    return codes, (-10 * torch.log10(torch.stack(errors))).mean().item()
 
 
 @torch.no_grad()
 def render_photo(model, scene: Scene, photo: int, code: Tensor) -> dict[str, np.ndarray]:
-    """Photo's viewpoint rendered under an appearance code (A,): arrays (H,W,...) by name of render_rays.
-
-    Adds `mask` (H,W): what the mask network thinks of the real photo, and `truth` (H,W,3).
-    """
+    """A photo's view under an appearance code (A,): arrays (H,W,...) by name of render_rays. Adds
+    `mask` (H,W): what the mask network thinks of the real photo, and `truth` (H,W,3)."""
     w, h = scene.wh[photo].tolist()
     img = torch.tensor([photo], device=scene.rgb.device)
     parts = []
     for pixel in torch.arange(w * h, device=img.device).split(CHUNK):
         rays = make_rays(scene, img.expand(len(pixel)), pixel)
         out = model.render(rays, code.expand(len(pixel), -1))
-        out["mask"] = model.mask_of(img, rays.uv)
-        out["truth"] = rays.rgb
+        out |= dict(mask=model.mask_of(rays, img), truth=rays.rgb)
         parts.append({k: v for k, v in out.items() if len(v) == len(pixel)})
-    joined = {k: torch.cat([p[k] for p in parts]).float().cpu().numpy() for k in parts[0]}
-    return {k: v.reshape(h, w, *v.shape[1:]) for k, v in joined.items()}
+    whole = {k: torch.cat([p[k] for p in parts]).float().cpu().numpy() for k in parts[0]}
+    return {k: v.reshape(h, w, *v.shape[1:]) for k, v in whole.items()}
 
 
 def to_uint8(picture: np.ndarray) -> np.ndarray:
@@ -1302,103 +1490,104 @@ def floor_picture(truth: np.ndarray) -> np.ndarray:
     return to_uint8(truth[:, :truth.shape[1] // 2].mean(1, keepdims=True))
 
 
-def evaluate(model, scene: Scene, cfg: Config, lpips: LPIPS | None) -> dict:
-    """Scores test photos by the half-image protocol [D12]: PSNR, SSIM, LPIPS, floor, per photo and mean."""
-    photos = torch.nonzero(scene.is_test)[:, 0]  # (B,)
-    if not len(photos):
-        return dict(psnr=None, psnr_floor=None, ssim=None, lpips=None, per_image=[], frames=[])
-    codes = fit_codes(model, scene, photos, None, 128, cfg.protocol)  # (B,A)
-    rows, frames = [], []
-    for photo, code in zip(photos.tolist(), codes):
-        frame = render_photo(model, scene, photo, code)
-        half = frame["rgb"].shape[1] // 2
-        got, want = to_uint8(frame["rgb"])[:, half:], to_uint8(frame["truth"])[:, half:]
-        flat = np.broadcast_to(floor_picture(frame["truth"]), want.shape)
-        row = dict(name=str(scene.raw["name"][photo]), psnr=psnr(got, want), psnr_floor=psnr(flat, want),
-                   ssim=ssim(got, want), lpips=None)
-        if lpips is not None and min(got.shape[:2]) >= 32:
-            pair = [torch.as_tensor(p, device=scene.rgb.device).permute(2, 0, 1)[None] / 255 for p in (got, want)]
-            row["lpips"] = lpips(*pair).item()
-        rows.append(row)
-        frames.append((row["name"], frame))
+def score(frame: dict[str, np.ndarray], lpips: LPIPS | None, device) -> dict:
+    """The right half of a rendered photo [D12] against the truth, beside two trivial predictors."""
+    half = frame["rgb"].shape[1] // 2
+    got, want = to_uint8(frame["rgb"])[:, half:], to_uint8(frame["truth"])[:, half:]
+    flat = np.broadcast_to(floor_picture(frame["truth"]), want.shape)
+    mean = np.broadcast_to(flat.mean((0, 1)).round(), want.shape)
+    row = dict(psnr=psnr(got, want), psnr_floor=psnr(flat, want), psnr_mean_color=psnr(mean, want),
+               ssim=ssim(got, want), lpips=None)
+    if lpips is not None and min(got.shape[:2]) >= 32:
+        pair = [torch.as_tensor(p, device=device).permute(2, 0, 1)[None] / 255 for p in (got, want)]
+        row["lpips"] = lpips(*pair).item()
+    return row
 
-    def mean(key):
-        values = [r[key] for r in rows if r[key] is not None]
-        return float(np.mean(values)) if values else None
-    return dict({k: mean(k) for k in ("psnr", "psnr_floor", "ssim", "lpips")}, per_image=rows, frames=frames)
+
+def summary(rows: list[dict], key: str) -> tuple[float | None, float | None]:
+    """Mean and spread (standard deviation) over rows of a figure; None if no row has it."""
+    values = [row[key] for row in rows if row.get(key) is not None]
+    return (float(np.mean(values)), float(np.std(values))) if values else (None, None)
+
+
+def evaluate(model, scene: Scene, cfg: Config, lpips: LPIPS | None) -> dict:
+    """Scores of the test photos by the half-image protocol [D12], per photo and on average."""
+    photos, rows, frames = scene.photos(True), [], []  # (B,)
+    codes = fit_codes(model, scene, photos, None, 128, cfg.protocol) if len(photos) else []  # (B,A)
+    for photo, code in zip(photos.tolist(), codes):
+        name, frame = str(scene.raw["name"][photo]), render_photo(model, scene, photo, code)
+        rows.append(dict(name=name) | score(frame, lpips, scene.rgb.device))
+        frames.append((name, frame))
+    keys = ("psnr", "psnr_floor", "psnr_mean_color", "ssim", "lpips")
+    return {k: summary(rows, k)[0] for k in keys} | dict(per_image=rows, frames=frames)
 
 
 @torch.no_grad()
 def toy_truth(model, scene: Scene) -> dict:
-    """What only a synthetic scene can tell: SDF error, mask IoU, mean mask on static pixels.
-
-    sdf_error: mean |s - s_true| at points within 0.05 of visible surfaces, scene units. mask_iou: of M > 0.5
-    with the true occluders over all training photos; None where there is no model part to score.
-    """
-    raw, found = scene.raw, {}
-    rng = np.random.default_rng(0)
-    pixel = torch.as_tensor(rng.choice(np.flatnonzero(np.isfinite(raw["depth"])), 20_000))
-    img = torch.searchsorted(torch.as_tensor(raw["start"]), pixel, right=True) - 1
-    rays = make_rays(scene, img.to(scene.rgb.device), (pixel - torch.as_tensor(raw["start"])[img]).to(scene.rgb.device))
-    depth = torch.as_tensor(raw["depth"][pixel].astype(np.float32), device=rays.o.device)
-    x = rays.o + depth[:, None] * rays.d  # (P,3) on the true surface
-    x = x + torch.as_tensor(rng.normal(0, 0.02, x.shape), device=x.device, dtype=x.dtype)
-    world = x.double().cpu().numpy() * raw["scale"] + raw["center"]
-    true = torch.as_tensor(data_prep.toy_sdf(world, ground=scene.info["background"]) / raw["scale"])  # (P,)
-    near = ((true.abs() < 0.05).to(x.device)) & (x.norm(dim=1) < 1)
-    found["sdf_error"] = None
-    if hasattr(model, "sdf"):
-        s = torch.cat([model.sdf(part)[0] for part in x[near].split(CHUNK)]).cpu()
-        found["sdf_error"] = (s - true[near.cpu()]).abs().mean().item()
-    found["mask_iou"] = found["mask_static"] = None
-    both = either = static = pixels = 0
-    if getattr(model, "use_mask", False):
-        for i in torch.nonzero(~scene.is_test)[:, 0]:
-            occluder = torch.as_tensor(raw["occluder"][raw["start"][i]:raw["start"][i + 1]], device=x.device)
-            rays = make_rays(scene, i.expand(len(occluder)), torch.arange(len(occluder), device=x.device))
-            mask = model.mask_of(i[None], rays.uv)  # (N,)
-            both += ((mask > 0.5) & occluder).sum().item()
-            either += ((mask > 0.5) | occluder).sum().item()
-            static += mask[~occluder].sum().item()
-            pixels += (~occluder).sum().item()
-        found.update(mask_iou=both / either if either else None, mask_static=static / pixels)
+    """What only a synthetic scene can tell; None where the model has no such part. sdf_error: mean
+    |s - s_true| within 0.05 of visible surfaces, scene units. mask_iou, _static: M > 0.5 against
+    the true occluders over all training photos, and mean M on all other pixels."""
+    raw, dev = scene.raw, scene.rgb.device
+    found = dict.fromkeys(("sdf_error", "mask_iou", "mask_static"))
+    has_sdf, surface, mask, occluder = hasattr(model, "sdf"), [], [], []
+    for i in scene.photos(False)[:, None]:
+        span = slice(*scene.start[int(i):int(i) + 2].tolist())
+        pixel = torch.arange(span.stop - span.start, device=dev)
+        rays = make_rays(scene, i.expand(len(pixel)), pixel)
+        depth = torch.as_tensor(raw["depth"][span]).to(dev, torch.float32)
+        if has_sdf:
+            surface.append(rays.at(depth[:, None])[depth.isfinite()][::7, 0])  # (P,3)
+        if model.use_mask:
+            mask.append(model.mask_of(rays, i).cpu())
+            occluder.append(torch.as_tensor(raw["occluder"][span]))
+    if has_sdf:
+        x, gen = torch.cat(surface), torch.Generator().manual_seed(0)
+        x = x + 0.02 * torch.randn(x.shape, generator=gen).to(dev)  # (P,3) around the true surface
+        x = x[x.norm(dim=1) < 1]
+        x_file = x.cpu().numpy() * raw["scale"] + raw["center"]
+        true = data_prep.toy_sdf(x_file, scene.info["background"]) / raw["scale"]
+        true = torch.as_tensor(true)  # (P,)
+        s = torch.cat([model.sdf(part)[0] for part in x.split(CHUNK)]).cpu()  # (P,)
+        found["sdf_error"] = (s - true)[true.abs() < 0.05].abs().mean().item()
+    if model.use_mask:
+        mask, occluder = torch.cat(mask), torch.cat(occluder)
+        both, union = (mask > 0.5) & occluder, (mask > 0.5) | occluder
+        found["mask_iou"] = both.sum().item() / union.sum().item() if union.any() else None
+        found["mask_static"] = mask[~occluder].mean().item()
     return found
 
 
 @torch.no_grad()
 def extract_mesh(model: GeoNVS, resolution: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The surface s = 0 inside the unit sphere: vertices (N,3) in SfM units, faces (M,3), colours (N,3) uint8.
-
-    Marching cubes over a grid of `resolution` cells (default: two per finest octree cell, at most 512);
-    the cached SDF says which cells can hold the surface, and only their corners are evaluated.
-    """
-    scene, octree = model.scene, model.sdf.octree
+    """The surface s = 0 inside the unit sphere: vertices (N,3) in SfM units, faces (M,3), uint8
+    colours (N,3), by marching cubes over `resolution` cells (default: two per finest octree cell,
+    at most 512). Only corners are evaluated that are near the surface by the cached SDF."""
+    scene, octree, cache = model.scene, model.sdf.octree, model.cache
     n = resolution or min(2 * octree.resolution(octree.levels - 1), 512)
-    dev, line = model.cache.device, torch.linspace(-1, 1, n + 1)
-    near = F.interpolate(model.cache, size=(n + 1,) * 3, mode="trilinear", align_corners=True)[0, 0].abs()
-    near = (near < 3 * 2 / model.cache.shape[-1]) & (torch.cartesian_prod(line, line, line).norm(dim=1)
-                                                      .reshape(near.shape) < 1).to(dev)  # (n+1,n+1,n+1)
-    volume = np.ones(near.shape, np.float32)
-    index = torch.nonzero(near)  # (P,3)
-    if len(index):
-        s = torch.cat([model.sdf(part * (2 / n) - 1.0)[0] for part in index.split(2 ** 16)])
-        volume[near.cpu().numpy()] = s.cpu().numpy()
-    inside = near[1:, 1:, 1:]  # a cube counts if all its corners were evaluated
-    for corner in CORNERS[:-1].tolist():
-        inside = inside & near[tuple(slice(c, n + c) for c in corner)]
-    cubes = np.pad(inside.cpu().numpy(), ((0, 1),) * 3)
-    if not cubes.any() or not (volume[near.cpu().numpy()] < 0).any():
+    line = torch.linspace(-1, 1, n + 1, device=cache.device)
+    cached = F.interpolate(cache, size=(n + 1,) * 3, mode="trilinear", align_corners=True)[0, 0]
+    r = torch.cartesian_prod(line, line, line).norm(dim=1).reshape(cached.shape)  # (n+1,n+1,n+1)
+    near = (cached.abs() < 6 / cache.shape[-1]) & (r < 1)  # (n+1,n+1,n+1)
+    volume = torch.ones_like(cached)
+    for index in torch.nonzero(near).split(2 ** 16) if near.any() else ():  # (P,3)
+        volume[tuple(index.T)] = model.sdf(index * (2 / n) - 1.0)[0]
+    cubes = torch.ones_like(near[1:, 1:, 1:])  # (n,n,n): were all of its corners evaluated?
+    for corner in CORNERS.tolist():
+        cubes &= near[tuple(slice(c, n + c) for c in corner)]
+    cubes = F.pad(cubes, (1, 0) * 3)  # skimage looks a cube up at its last corner
+    if not cubes.any() or not (volume < 0).any():
         return np.zeros((0, 3)), np.zeros((0, 3), int), np.zeros((0, 3), np.uint8)
-    vertices, faces, _, _ = marching_cubes(volume, 0, mask=cubes, gradient_direction="ascent")
-    x = torch.as_tensor(vertices * (2 / n) - 1, dtype=torch.float32, device=dev)  # (N,3)
-    code = model.appearance.weight[~scene.is_test].mean(0)  # (A,)
-    colors = []
+    vertices, faces, _, _ = marching_cubes(volume.cpu().numpy(), 0, mask=cubes.cpu().numpy(),
+                                           gradient_direction="descent")
+    x = torch.as_tensor(vertices * (2 / n) - 1, dtype=torch.float32, device=line.device)  # (N,3)
+    code, colors = model.codes()[~scene.is_test].mean(0), []  # (A,)
     for part in x.split(2 ** 16):
         _, geo, grad = model.sdf.with_gradient(part)
         normal = F.normalize(grad, dim=1)
         inputs = torch.cat([geo, normal, sh_basis(-normal), code.expand(len(part), -1)], 1)
         colors.append(torch.sigmoid(model.color(inputs)))
-    return x.cpu().numpy() * scene.raw["scale"] + scene.raw["center"], faces, to_uint8(torch.cat(colors).cpu().numpy())
+    vertices = x.cpu().numpy() * scene.raw["scale"] + scene.raw["center"]
+    return vertices, faces, to_uint8(torch.cat(colors).cpu().numpy())
 
 
 def write_ply(path: Path, vertices: np.ndarray, faces: np.ndarray, colors: np.ndarray) -> None:
@@ -1406,10 +1595,12 @@ def write_ply(path: Path, vertices: np.ndarray, faces: np.ndarray, colors: np.nd
     v = np.empty(len(vertices), [("xyz", "<f4", 3), ("rgb", "u1", 3)])
     f = np.empty(len(faces), [("n", "u1"), ("index", "<i4", 3)])
     v["xyz"], v["rgb"], f["n"], f["index"] = vertices, colors, 3, faces
-    header = (f"ply\nformat binary_little_endian 1.0\nelement vertex {len(v)}\nproperty float x\nproperty float y\n"
-              "property float z\nproperty uchar red\nproperty uchar green\nproperty uchar blue\n"
-              f"element face {len(f)}\nproperty list uchar int vertex_indices\nend_header\n")
-    atomic_write(path, lambda tmp: Path(tmp).write_bytes(header.encode() + v.tobytes() + f.tobytes()))
+    kinds = [f"float {k}" for k in "xyz"] + [f"uchar {k}" for k in ("red", "green", "blue")]
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(v)}",
+              *[f"property {kind}" for kind in kinds], f"element face {len(f)}",
+              "property list uchar int vertex_indices", "end_header\n"]
+    data = "\n".join(header).encode() + v.tobytes() + f.tobytes()
+    atomic_write(path, lambda tmp: Path(tmp).write_bytes(data))
 
 
 def write_png(path: Path, picture: np.ndarray) -> None:
@@ -1426,30 +1617,39 @@ def colormap(value: np.ndarray, low: float, high: float) -> np.ndarray:
     return cv2.applyColorMap(grey, cv2.COLORMAP_VIRIDIS)[:, :, ::-1]
 
 
+def tiles_of(model, f: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """A rendered photo's pictures (H,W,3) uint8 by title."""
+    tiles = {"photo": to_uint8(f["truth"]), "render": to_uint8(f["rgb"]),
+             "mask M": colormap(f["mask"], 0, 1)}
+    if "normal" in f:
+        signal = model.cfg.lam_grad * f["e_grad"] + model.cfg.lam_lap * f["e_curv"]
+        centre, spread = model.calibration.tolist()
+        phi = 1 / (1 + np.exp(-(signal - centre) / spread))
+        tiles["geometry map"] = colormap(f["opacity"] * phi, 0, 1)
+    tiles["depth"] = colormap(1 / f["depth"], *np.quantile(1 / f["depth"], (0.02, 0.98)))
+    if "normal" in f:
+        tiles["normals"] = to_uint8(f["normal"] / 2 + 0.5)
+    return tiles
+
+
 def panel(model, frames: list[tuple[str, dict]], height: int = 180) -> np.ndarray:
     """The paper's Fig. 2: a row per photo; photo, render, mask, geometry map, depth, normals."""
-    cfg, rows, width = model.cfg, [], max(round(f["rgb"].shape[1] * height / f["rgb"].shape[0]) for _, f in frames)
-    titles = ["photo", "render", "mask M", "geometry map", "depth", "normals"]
-    for name, f in frames:
-        tiles = [to_uint8(f["truth"]), to_uint8(f["rgb"]), colormap(f["mask"], 0, 1)]
-        if "normal" in f:
-            signal = cfg.lam_grad * f["e_grad"] + cfg.lam_lap * f["e_curv"]
-            centre, spread = model.calibration.tolist()
-            tiles.append(colormap(f["opacity"] / (1 + np.exp(-(signal - centre) / spread)), 0, 1))
-        tiles.append(colormap(1 / f["depth"], *np.quantile(1 / f["depth"], (0.02, 0.98))))
-        if "normal" in f:
-            tiles.append(to_uint8(f["normal"] / 2 + 0.5))
-        row = []
-        for tile in tiles:
-            w = round(tile.shape[1] * height / tile.shape[0])
-            tile = cv2.resize(tile, (w, height), interpolation=cv2.INTER_AREA if w < tile.shape[1] else cv2.INTER_CUBIC)
-            row.append(np.pad(tile, ((2, 2), (2, 2 + width - w), (0, 0)), constant_values=255))
-        rows.append(np.concatenate(row, 1))
-        cv2.putText(rows[-1], name, (6, height - 4), cv2.FONT_HERSHEY_SIMPLEX, 0.36, (255, 255, 255), 1, cv2.LINE_AA)
+    widths = [round(f["rgb"].shape[1] * height / f["rgb"].shape[0]) for _, f in frames]
+    rows = []
+
+    def write(picture, text, at, size, color):
+        cv2.putText(picture, text, at, cv2.FONT_HERSHEY_SIMPLEX, size, color, 1, cv2.LINE_AA)
+    for (name, f), w in zip(frames, widths):
+        how = cv2.INTER_AREA if w < f["rgb"].shape[1] else cv2.INTER_CUBIC
+        tiles = {title: cv2.resize(tile, (w, height), interpolation=how)
+                 for title, tile in tiles_of(model, f).items()}
+        rows.append(np.concatenate([
+            np.pad(tile, ((2, 2), (2, 2 + max(widths) - w), (0, 0)), constant_values=255)
+            for tile in tiles.values()], 1))
+        write(rows[-1], name, (6, height - 4), 0.36, (255, 255, 255))
     head = np.full((20, rows[0].shape[1], 3), 255, np.uint8)
-    titles = titles if len(tiles) == 6 else titles[:3] + ["depth"]
-    for i, title in enumerate(titles):
-        cv2.putText(head, title, (6 + i * (width + 4), 14), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (0, 0, 0), 1, cv2.LINE_AA)
+    for i, title in enumerate(tiles):
+        write(head, title, (6 + i * (max(widths) + 4), 14), 0.45, (0, 0, 0))
     return np.concatenate([head, *rows])
 
 
@@ -1457,67 +1657,269 @@ def finish(model, scene: Scene, cfg: Config, state: dict, meter: EnergyMeter, ru
     """Scores a trained model and writes metrics.json, panel.png and mesh.ply below run."""
     scores = evaluate(model, scene, cfg, make_lpips(scene.rgb.device))
     frames = [(f"held out: {name}", frame) for name, frame in scores.pop("frames")[:3]]
-    train_photos = torch.nonzero(~scene.is_test)[:, 0]
-    busy = train_photos
-    if getattr(model, "use_mask", False):  # training photos with most on the mask
-        busy = train_photos[model.logits[train_photos].sigmoid().mean((1, 2, 3)).argsort(descending=True)]
+    busy = scene.photos(False)
+    if hasattr(model, "logits"):  # training photos with most on the mask
+        busy = busy[model.logits[busy].sigmoid().mean((1, 2, 3)).argsort(descending=True)]
     for i in busy[:2].tolist():
-        frames.append((f"training: {scene.raw['name'][i]}", render_photo(model, scene, i, model.appearance.weight[i])))
+        frame = render_photo(model, scene, i, model.codes()[i])
+        frames.append((f"training: {scene.raw['name'][i]}", frame))
     write_png(run / "panel.png", panel(model, frames))
     if hasattr(model, "sdf"):
         write_ply(run / "mesh.ply", *extract_mesh(model))
-    octrees = model.octrees()
-    commit = subprocess.run(["git", "-C", str(Path(__file__).parent), "rev-parse", "--short", "HEAD"],
-                            capture_output=True, text=True).stdout.strip() or None
+    octrees, is_gpu = model.octrees(), scene.rgb.is_cuda
+    cpu = f"cpu, {torch.get_num_threads()} threads"
+    structure = sum(o.bytes() - 4 * o.features.numel() for o in octrees)
+    git = ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short", "HEAD"]
+    fitted = "left half" if cfg.protocol == "half" else "WHOLE photo (leaky)"
     metrics = dict(
         scene=scene.info["scene"], method=cfg.method, seed=cfg.seed, steps=state["step"],
-        device=torch.cuda.get_device_name() if scene.rgb.is_cuda else f"cpu, {torch.get_num_threads()} threads",
+        device=torch.cuda.get_device_name() if is_gpu else cpu,
         **scores, train_seconds=state["seconds"], **meter.report(),
+        curve=state["curve"], dropped=state["dropped"],
         rays_per_second=state["step"] * cfg.rays / max(state["seconds"], 1e-9),
         parameters=sum(p.numel() for p in model.parameters()),
         octree_cells=[len(c) for o in octrees[:1] for c in o.cells] or None,
-        model_bytes=sum(t.numel() * t.element_size() for t in model.parameters()) + sum(o.bytes() for o in octrees),
-        peak_memory_bytes=torch.cuda.max_memory_allocated() if scene.rgb.is_cuda else peak_rss(),
-        protocol=f"appearance fitted on the {'left half' if cfg.protocol == 'half' else 'WHOLE photo (leaky)'}, "
-                 "scored on the right half",
-        torch=torch.__version__, python=platform.python_version(), commit=commit, config=asdict(cfg))
+        octree_bytes=octrees[0].bytes() if octrees else None,
+        model_bytes=sum(p.numel() * p.element_size() for p in model.parameters()) + structure,
+        peak_memory_bytes=torch.cuda.max_memory_allocated() if is_gpu else peak_rss(),
+        protocol=f"appearance fitted on the {fitted}, scored on the right half",
+        torch=torch.__version__, python=platform.python_version(), config=asdict(cfg),
+        commit=subprocess.run(git, capture_output=True, text=True).stdout.strip() or None)
     if scene.info["kind"] == "toy":
-        metrics.update(toy_truth(model, scene))
-    atomic_write(run / "metrics.json", lambda tmp: Path(tmp).write_text(json.dumps(metrics, indent=1)))
+        metrics |= toy_truth(model, scene)
+    write_text(run / "metrics.json", json.dumps(metrics, indent=1))
     return metrics
+
+
+def camera_path(c2w: Tensor, count: int, keys: int = 6) -> Tensor:
+    """A smooth path (count,3,4) through cameras (B,3,4), along the axis on which they spread."""
+    centre = c2w[:, :, 3] - c2w[:, :, 3].mean(0)  # (B,3)
+    order = (centre @ torch.linalg.svd(centre)[2][0]).argsort()  # (B,)
+    stops = torch.linspace(0, len(order) - 1, min(keys, len(order))).round().long()
+    stops = c2w[order[stops]]  # (keys,3,4)
+    u = torch.linspace(0, len(stops) - 1 - 1e-4, count)  # (count,)
+    i = u.long()
+    f = (u - i)[:, None, None].to(c2w)
+    f = f * f * (3 - 2 * f)  # rests at every key
+    path = torch.lerp(stops[i], stops[(i + 1).clamp(max=len(stops) - 1)], f)  # (count,3,4)
+    left, _, right = torch.linalg.svd(path[:, :, :3])  # the nearest rotation
+    return torch.cat([left @ right, path[:, :, 3:]], 2)
+
+
+def film(model, scene: Scene, kind: str, path: Path, count: int = 72) -> None:
+    """mp4 at 24 frames/s: a path through the training cameras, or one view in all appearances."""
+    photos = scene.photos(False)
+    c2w, codes = scene.c2w[photos], model.codes()[photos]
+    centre = c2w[:, :, 3].mean(0)
+    view = photos[(c2w[:, :, 3] - centre).norm(dim=1).argmin()].item()  # the middle one
+    w, h = (scene.wh[view] // 2 * 2).tolist()
+    if kind == "orbit":
+        poses, codes = camera_path(c2w, count), codes.mean(0).expand(count, -1)
+    else:
+        u = torch.linspace(0, len(photos) - 1.001, count)[:, None].to(codes)
+        i = u[:, 0].long()
+        codes = torch.lerp(codes[i], codes[i + 1], u % 1)
+        poses = scene.c2w[view].expand(count, 3, 4)
+
+    def write(tmp):
+        video = cv2.VideoWriter(str(tmp), cv2.VideoWriter_fourcc(*"mp4v"), 24, (w, h))
+        if not video.isOpened():
+            raise OSError("OpenCV cannot write mp4 here")
+        for pose, code in zip(poses, codes):
+            moved = scene.c2w.clone()
+            moved[view] = pose
+            frame = render_photo(model, scene._replace(c2w=moved), view, code)["rgb"]
+            video.write(np.ascontiguousarray(to_uint8(frame)[:h, :w, ::-1]))
+        video.release()
+    atomic_write(path, write)
+    print(f"wrote {path}")
 
 
 def peak_rss() -> int:
     """Largest resident memory of this process, bytes."""
     import resource  # absent on Windows
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+    unit = 1 if sys.platform == "darwin" else 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
 
 
-# ---------------------------------------------------------------------------------------------------
-# 12 Command line
-# ---------------------------------------------------------------------------------------------------
+# ---- 12 Experiments: speed against accuracy, what each piece buys --------------------------------
+
+ABLATION = {  # one thing changed at a time
+    "full": {}, "no GPL": dict(lam_gpl=0.0), "literal GPL": dict(gpl="literal"),
+    "no mask": dict(mask="off"), "no appearance": dict(appearance="off"),
+    "no SfM term": dict(lam_sfm=0.0), "no background": dict(background="off"),
+    "no curvature": dict(lam_curv=0.0), "no Lipschitz": dict(lam_lps=0.0),
+    "uniform sampling": dict(sampling="uniform"), "printed alpha": dict(alpha="printed"),
+    "finite differences": dict(normals="fd"), "uniform grid": dict(grid="uniform"),
+    "one level less": dict(levels=-1), "one level more": dict(levels=1),
+}
+STYLES = {"geonvsw": ("o-", "#0072B2"), "nerfw": ("s--", "#D55E00"), "hanerf": ("^:", "#009E73")}
+
+
+def read_metrics(run: Path) -> dict:
+    if not (run / "metrics.json").exists():
+        raise UserError(f"{run} holds no metrics.json: give folders of finished runs")
+    return json.loads((run / "metrics.json").read_text())
+
+
+def run_once(given: dict, run: Path, arrays: dict | None = None) -> dict:
+    """Metrics of one training; a finished run is read, so that a matrix can go on."""
+    if (run / "metrics.json").exists():
+        return read_metrics(run)
+    cfg = make_config(given)
+    check(cfg)
+    print(f"--- {run}", flush=True)
+    return execute(cfg, arrays if arrays is not None else find_scene(cfg), run)
+
+
+def write_table(path: Path, rows: list[dict]) -> None:
+    """CSV of rows with the same keys; None stays empty."""
+    def cell(v):
+        return "" if v is None else f"{v:.5g}" if isinstance(v, float) else str(v)
+    lines = [list(rows[0])] + [[cell(v) for v in row.values()] for row in rows]
+    write_text(path, "".join(",".join(line) + "\n" for line in lines))
+
+
+def plotting():
+    try:
+        import matplotlib.pyplot as plt
+    except ImportError:
+        raise UserError("charts need matplotlib: pip install matplotlib") from None
+    plt.switch_backend("Agg")
+    return plt
+
+
+def save_figure(figure, path: Path) -> None:
+    atomic_write(path, lambda tmp: figure.savefig(tmp, dpi=110, bbox_inches="tight"))
+    print(f"wrote {path}")
+
+
+def spreads(metrics: list[dict], *keys: str) -> dict:
+    """Mean and spread over runs of several figures, as cells of a table."""
+    pairs = ((key, summary(metrics, key)) for key in keys)
+    return {name: v for key, (mean, std) in pairs for name, v in ((key, mean), (key + "_std", std))}
+
+
+def reached(curve: list[dict], level: float, unit: str) -> float | None:
+    """Seconds or watt-hours at which a curve first reaches a PSNR, log-interpolated, or None."""
+    for a, b in zip([None] + curve, curve):
+        if b["psnr"] >= level and b[unit] is not None:
+            if a is None or b["psnr"] == a["psnr"]:
+                return b[unit]
+            f = (level - a["psnr"]) / (b["psnr"] - a["psnr"])
+            return a[unit] ** (1 - f) * b[unit] ** f
+    return None
+
+
+def by_method(metrics: list[dict]) -> dict[str, list[dict]]:
+    groups = {method: [m for m in metrics if m["method"] == method] for method in METHODS}
+    return {method: mine for method, mine in groups.items() if mine}
+
+
+def plot_curves(axis, metrics: list[dict], unit: str, xlabel: str) -> None:
+    """PSNR over seconds or watt-hours: a line for each method's mean, a band from worst to best."""
+    for method, mine in by_method(metrics).items():
+        curves = [m["curve"] for m in mine if m["curve"]]
+        n = min(map(len, curves), default=0)
+        if n and all(c[0][unit] is not None for c in curves):
+            x, y = (np.array([[p[k] for p in c[:n]] for c in curves]) for k in (unit, "psnr"))
+            line, color = STYLES[method]
+            label = f"{method} ({len(curves)} seeds)"
+            axis.plot(x.mean(0), y.mean(0), line, color=color, ms=4, label=label)
+            axis.fill_between(x.mean(0), y.min(0), y.max(0), color=color, alpha=0.2)
+    if axis.lines:
+        axis.set_xscale("log")
+        floor, _ = summary(metrics, "psnr_floor")
+        axis.axhline(floor, color="grey", lw=1, ls="-.", label="trivial predictor")
+        axis.legend()
+    else:
+        axis.text(0.5, 0.5, f"no {unit} in these runs\n(--curve records, energy needs a counter)",
+                  ha="center", va="center", transform=axis.transAxes)
+    axis.set(xlabel=xlabel, ylabel="PSNR on held-out left halves, dB")
+    axis.grid(alpha=0.3)
+
+
+def chart(given: dict, runs: list[str], seeds: int) -> None:
+    """chart.png: PSNR over seconds and over watt-hours, one curve a method; chart.csv: a table."""
+    plt = plotting()
+    if not runs:
+        given = dict(minutes=2.0, steps=10 ** 7, curve=True) | given
+        stem = f"runs/chart-{scene_name(make_config(given))}"
+        for seed, method in itertools.product(range(seeds), METHODS):
+            runs = [*runs, f"{stem}-{method}-{seed}"]
+            run_once(given | dict(method=method, seed=seed), Path(runs[-1]))
+    metrics, rows = [read_metrics(Path(run)) for run in runs], []
+    for method, mine in by_method(metrics).items():
+        row = dict(method=method, runs=len(mine)) | spreads(
+            mine, "psnr", "ssim", "psnr_floor", "train_seconds", "energy_wh", "rays_per_second",
+            "parameters")
+        for level in range(14, 32):
+            for unit in ("seconds", "wh"):
+                hits = [reached(m["curve"], level, unit) for m in mine]
+                row[f"{unit}_to_{level}dB"] = None if None in hits else float(np.mean(hits))
+        rows.append(row)
+    figure, axes = plt.subplots(1, 2, figsize=(11, 4.2), sharey=True)
+    plot_curves(axes[0], metrics, "seconds", "training time, s")
+    plot_curves(axes[1], metrics, "wh", "energy, Wh")
+    figure.suptitle(f"{metrics[0]['scene']}: speed against accuracy ({metrics[0]['device']})")
+    save_figure(figure, Path("chart.png"))
+    write_table(Path("chart.csv"), rows)
+
+
+def ablation(given: dict, seeds: int) -> None:
+    """What each piece buys: ABLATION's rows, mean and spread, as ablation.csv and png."""
+    plt, rows, scene = plotting(), [], scene_name(make_config(given))
+    for name, change in ABLATION.items():
+        if "levels" in change:
+            change = dict(levels=levels + change["levels"])
+        stem = Path("runs") / f"ablation-{scene}-{name.replace(' ', '_')}"
+        metrics = [run_once(given | change | dict(seed=i), Path(f"{stem}-{i}"))
+                   for i in range(seeds)]
+        cells = metrics[0]["octree_cells"]
+        levels = len(cells) if name == "full" else levels
+        rows.append(dict(row=name, runs=seeds, cells=sum(cells)) | spreads(
+            metrics, "psnr", "ssim", "sdf_error", "mask_iou", "mask_static", "octree_bytes",
+            "rays_per_second", "train_seconds"))
+    write_table(Path("ablation.csv"), rows)
+    names, mean, std = zip(*[(r["row"], r["psnr"], r["psnr_std"]) for r in rows])
+    figure, axis = plt.subplots(figsize=(8, 0.35 * len(rows) + 1))
+    axis.barh(names, mean, xerr=std, color=STYLES["geonvsw"][1])
+    axis.axvline(mean[0], color="black", lw=1)
+    axis.invert_yaxis()
+    axis.set(xlabel="PSNR, dB (bar: spread over seeds)", xlim=(min(mean) - 1, None),
+             title=f"{scene}: one piece changed at a time")
+    save_figure(figure, Path("ablation.png"))
+
+
+# ---- 13 Command line -----------------------------------------------------------------------------
 
 
 class Parser(argparse.ArgumentParser):
     """Bad flags end with one sentence that names the nearest right one."""
-
     def error(self, message):
         for word in message.split():
-            if word.startswith("--"):
-                near = difflib.get_close_matches(word.split("=")[0], self._option_string_actions, 1)
-                message += f"; did you mean {near[0]}?" if near and "unrecognized" in message else ""
+            near = difflib.get_close_matches(word.split("=")[0], self._option_string_actions, 1)
+            if word.startswith("--") and near and "unrecognized" in message:
+                message += f"; did you mean {near[0]}?"
         raise UserError(f"{message} (python geonvs.py --help lists all flags)")
 
 
 def make_parser() -> argparse.ArgumentParser:
-    parser = Parser(description=__doc__.split("\n\n")[0], allow_abbrev=False, argument_default=argparse.SUPPRESS,
+    parser = Parser(description=__doc__.split("\n\n")[0], allow_abbrev=False,
+                    argument_default=argparse.SUPPRESS,
                     formatter_class=argparse.ArgumentDefaultsHelpFormatter)
     for f in fields(Config):
-        kind = {"int": int, "float": float, "str": str}.get(f.type)
-        more = dict(type=kind, choices=f.metadata["choices"]) if kind else dict(action=argparse.BooleanOptionalAction)
+        more = dict(type=type(f.default), choices=f.metadata["choices"])
+        if f.type == "bool":
+            more = dict(action=argparse.BooleanOptionalAction)
         parser.add_argument(f"--{f.name}", help=f"{f.metadata['help']} [{f.default}]", **more)
-    parser.add_argument("--resume", action="store_true", help="go on from the run's checkpoint")
-    parser.add_argument("--render", choices=("orbit", "appearance"), help="write a short film of a finished run")
+    add = parser.add_argument
+    add("--resume", action="store_true", help="go on from the run's checkpoint")
+    add("--chart", nargs="*", metavar="RUN", help="speed against accuracy: of finished runs, or of "
+        "the three methods trained now")
+    add("--ablation", action="store_true", help="what each piece buys")
+    add("--seeds", type=int, help="seeds for --chart and --ablation [3]")
+    add("--render", choices=("orbit", "appearance"), help="write a short film of a finished run")
     return parser
 
 
@@ -1528,74 +1930,117 @@ def pick_device(name: str) -> torch.device:
         device = torch.device(name)
     except RuntimeError:
         raise UserError(f"--device {name} is unknown: use auto, cpu, cuda or cuda:N") from None
+    if device.type not in ("cpu", "cuda"):
+        raise UserError(f"--device {name} is not supported: use auto, cpu, cuda or cuda:N")
     if device.type == "cuda" and not torch.cuda.is_available():
-        raise UserError("--device cuda: torch finds no GPU here; use --device cpu, or install torch with CUDA")
+        raise UserError("--device cuda: torch finds no GPU here: use cpu, or a torch with CUDA")
     return device
 
 
-def find_scene(cfg: Config) -> Path:
-    """The scene file of a configuration, made on first use. Raises UserError."""
-    if cfg.data:
-        name = Path(cfg.data).resolve().name
-    elif cfg.scene in ("toy", *data_prep.SCENES):
-        name = cfg.scene
-    else:
-        near = difflib.get_close_matches(cfg.scene, SCENES, 1)
-        raise UserError(f"--scene {cfg.scene} is unknown: use one of {', '.join(SCENES)}"
+def scene_name(cfg: Config) -> str:
+    return Path(cfg.data).resolve().name if cfg.data else cfg.scene
+
+
+def find_scene(cfg: Config) -> dict:
+    """The scene of a configuration: data/<name>.npz, made on first use. Raises UserError."""
+    name = scene_name(cfg)
+    if not cfg.data and name not in SCENES:
+        near = difflib.get_close_matches(name, SCENES, 1)
+        raise UserError(f"--scene {name} is unknown: use one of {', '.join(SCENES)}"
                         + (f"; did you mean {near[0]}?" if near else ""))
-    path = Path("data") / (f"{name}.npz" if name == "toy" else f"{name}_x{cfg.downscale}.npz")
-    if not path.exists():
-        print(f"making {path}")
-        arrays = data_prep.prepare(cfg.data, cfg.downscale) if cfg.data else data_prep.make_toy() \
-            if name == "toy" else data_prep.locate_and_prepare(name, "data", cfg.downscale)
-        path.parent.mkdir(exist_ok=True)
-        data_prep.write_scene(path, arrays)
-    return path
+    where = f"-{zlib.crc32(str(Path(cfg.data).resolve()).encode()):08x}" if cfg.data else ""
+    path = Path("data") / f"{name}{where}.npz"  # two folders of one name are two scenes
+    scene = data_prep.read_scene(path) if path.exists() else None
+    if scene and (name == "toy" or json.loads(str(scene["info"]))["downscale"] == cfg.downscale):
+        return scene
+    print(f"making {path}")
+    if cfg.data:
+        scene = data_prep.prepare(cfg.data, cfg.downscale)
+    elif name == "toy":
+        scene = data_prep.make_toy()
+    else:
+        scene = data_prep.locate_and_prepare(name, "data", cfg.downscale)
+    data_prep.write_scene(path, scene)
+    return scene
 
 
 def check(cfg: Config) -> None:
     """Refuses settings that cannot work, before anything is written."""
-    for f in fields(cfg):
-        value = getattr(cfg, f.name)
-        if isinstance(value, (int, float)) and (not math.isfinite(value) or value < 0):
-            raise UserError(f"--{f.name} {value} makes no sense: use a number >= 0")
-    for name in ("rays", "photos", "samples", "bg_samples", "steps", "downscale", "channels", "hidden", "mask_every"):
-        if getattr(cfg, name) < 1 + (name in ("samples", "bg_samples")):
-            raise UserError(f"--{name} {getattr(cfg, name)} is too small")
+    for name, value in asdict(cfg).items():
+        if isinstance(value, (int, float)) and not 0 <= value < 2 ** 63:
+            raise UserError(f"--{name} {value} makes no sense: use a number >= 0")
+    least = dict(samples=2, bg_samples=2, rays=2, mask_px=16) | dict.fromkeys(
+        ("photos", "steps", "downscale", "channels", "hidden", "mask_every", "bg_levels"), 1)
+    least |= dict(rays=1024) if cfg.method == "hanerf" else {}  # its encoder reads the grid of rays
+    for name, bound in least.items():
+        if getattr(cfg, name) < bound:
+            raise UserError(f"--{name} {getattr(cfg, name)} is too small: use at least {bound}")
+    if max(cfg.levels, cfg.bg_levels) > 9:
+        raise UserError("--levels and --bg_levels go up to 9: 4096 cells a side")
     if cfg.rays % cfg.photos:
         raise UserError(f"--rays {cfg.rays} must be a multiple of --photos {cfg.photos}")
 
 
-def main(argv: list[str] | None = None) -> int:
-    given = vars(make_parser().parse_args(argv))
-    resume, film = given.pop("resume", False), given.pop("render", None)
-    cfg = Config(**(SCENES.get(given.get("scene", "toy"), {}) if "data" not in given else {}) | given)
-    check(cfg)
+def execute(cfg: Config, arrays, run: Path, saved: dict | None = None) -> dict:
+    """Trains and scores one model on a scene file or its dictionary; returns its metrics."""
     device = pick_device(cfg.device)
-    scene_name = Path(cfg.data).resolve().name if cfg.data else cfg.scene
-    run = Path("runs") / (cfg.name or f"{scene_name}-{cfg.method}-{cfg.seed}")
-    saved = None
-    if resume or film:
-        saved = read_checkpoint(run / "checkpoint.pt", device)
-        cfg = Config(**saved["config"] | given)
-    scene = load_scene(find_scene(cfg), device, cfg.mask_px)
+    scene = load_scene(arrays, device, cfg.mask_px)
     run.mkdir(parents=True, exist_ok=True)
-    print(f"{cfg.method} on {scene.info['scene']}: {len(scene.wh)} photos ({int(scene.is_test.sum())} held out), "
-          f"{len(scene.rgb):,} pixels, {device}; writes {run}/")
+    print(f"{cfg.method} on {scene.info['scene']}: {len(scene.wh)} photos "
+          f"({len(scene.photos(True))} held out), {len(scene.rgb):,} pixels; {device}; {run}/")
     model, state, meter = train(cfg, scene, run, saved)
     metrics = finish(model, scene, cfg, state, meter, run)
-    shown = {k: round(metrics[k], 4) for k in ("psnr", "psnr_floor", "ssim", "lpips", "sdf_error", "mask_iou",
-                                               "mask_static", "train_seconds", "energy_wh") if metrics.get(k) is not None}
-    print("  " + "  ".join(f"{k} {v}" for k, v in shown.items()))
-    return 0
+    shown = ("psnr", "psnr_floor", "ssim", "lpips", "sdf_error", "mask_iou", "mask_static",
+             "train_seconds", "energy_wh")
+    print("".join(f"  {k} {metrics[k]:.4g}" for k in shown if metrics.get(k) is not None))
+    return metrics
+
+
+def render_film(kind: str, run: Path, given: dict) -> None:
+    """Loads a finished run and films it."""
+    device = pick_device(given.get("device", "auto"))
+    saved = read_checkpoint(run / "checkpoint.pt", device)
+    cfg = Config(**saved["config"] | given)
+    scene = load_scene(find_scene(cfg), device, cfg.mask_px)
+    gen = torch.Generator(device).manual_seed(cfg.seed)
+    model = METHODS[cfg.method][0](cfg, scene, gen)
+    restore(saved, run / "checkpoint.pt", model, None, None)
+    film(model, scene, kind, run / f"{kind}.mp4")
+
+
+def make_config(given: dict) -> Config:
+    """Config's defaults, then the scene's settings, the method's published ones, and flags."""
+    scene = {} if given.get("data") else SCENES.get(given.get("scene", "toy"), {})
+    return Config(**scene | METHODS[given.get("method", "geonvsw")][1] | given)
+
+
+def main(argv: list[str] | None = None) -> None:
+    given = vars(make_parser().parse_args(argv))
+    names = ("resume", "render", "chart", "ablation", "seeds")
+    commands = {k: given.pop(k) for k in names if k in given}
+    cfg, seeds = make_config(given), commands.get("seeds", 3)
+    check(cfg)
+    device = pick_device(cfg.device)
+    run = Path("runs") / (cfg.name or f"{scene_name(cfg)}-{cfg.method}-{cfg.seed}")
+    if "chart" in commands:
+        chart(given, commands["chart"], seeds)
+    elif "ablation" in commands:
+        ablation(given, seeds)
+    elif "render" in commands:
+        render_film(commands["render"], run, given)
+    else:
+        saved = read_checkpoint(run / "checkpoint.pt", device) if "resume" in commands else None
+        cfg = Config(**saved["config"] | given) if saved else cfg
+        execute(cfg, find_scene(cfg), run, saved)
 
 
 def run_command_line(entry) -> None:
     """Exit code 0, or 2 with one sentence on stderr."""
     try:
-        sys.exit(entry())
+        entry()
     except UserError as error:
-        sys.exit(print(f"error: {error}", file=sys.stderr) or 2)
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)
 
 
 if __name__ == "__main__":
