@@ -397,7 +397,7 @@ def statistics(scene):
     footprint: lower quartile of a pixel's size at the SfM points inside the sphere, over the training
     photos, so that the closest photos decide without single outliers. exposure_spread: standard
     deviation over photos of how much brighter (0..1) each shows the same points. bg_color (3,): the
-    colour of all rays that miss the sphere, NaN unless they agree.
+    colour of the rays that miss the sphere, NaN unless three in five agree.
     """
     K, c2w, photo = scene["K"], scene["c2w"], scene["track_photo"]
     keep = ~scene["is_test"][photo]
@@ -415,12 +415,13 @@ def statistics(scene):
     inside = np.linalg.norm(scene["points"][point], axis=1) < 1
     seen = np.maximum(np.bincount(point, minlength=len(scene["points"])), 1)
     bright -= (np.bincount(point, bright, len(scene["points"])) / seen)[point]
-    count = np.bincount(photo, minlength=len(K))
-    spread = np.std(np.bincount(photo, bright, len(K))[count > 0] / count[count > 0])
-    beyond = np.concatenate(beyond) / 255
-    flat = len(beyond) > 100 and beyond.std(0).max() < 0.01
-    return dict(scene, footprint=np.quantile(size[inside], 0.25), exposure_spread=spread,
-                bg_color=beyond.mean(0) if flat else np.full(3, np.nan))
+    spread = np.std([np.median(bright[photo == i]) for i in np.unique(photo)])
+    beyond = np.concatenate(beyond) / 255                    # people may stand before it
+    color = np.median(beyond, 0) if len(beyond) > 100 else np.full(3, np.nan)
+    flat = len(beyond) > 100 and (np.abs(beyond - color) < 0.02).all(1).mean() > 0.6
+    size = size[inside] if inside.any() else np.linalg.norm(c2w[:, :, 3], axis=1) / K[:, 0]
+    return dict(scene, footprint=np.quantile(size, 0.25), exposure_spread=spread,
+                bg_color=color if flat else np.full(3, np.nan))
 
 
 # ---- photos with a COLMAP reconstruction --------------------------------------------------------

@@ -681,7 +681,7 @@ def edge_indicator(e_grad: Tensor, e_curv: Tensor, lam_grad: float, lam_lap: flo
 
 def calibrate(x: Tensor, calibration: Tensor, rate: float = 0.05) -> None:
     """Moves calibration (2,) to the batch's: 75th percentile and width (p95 - p50) / 4. [D3]"""
-    p50, p75, p95 = torch.quantile(x.detach().nan_to_num(), x.new_tensor([0.5, 0.75, 0.95]))
+    p50, p75, p95 = torch.quantile(x.detach().nan_to_num(0, 0, 0), x.new_tensor([0.5, 0.75, 0.95]))
     calibration.lerp_(torch.stack([p75, ((p95 - p50) / 4).clamp(min=1e-3)]), rate)
 
 
@@ -839,14 +839,14 @@ class GeoNVS(Method):
                    mask=mask.mean(), gpl=gpl_loss(mask, edge))
         total = (raw["rgb"] + cfg.lam_eik * raw["eik"] + cfg.lam_curv * raw["curv"]
                  + cfg.lam_lps * raw["lps"] + cfg.lam_off * raw["off"] + cfg.lam_sfm * raw["sfm"])
-        misfit = error.detach().nan_to_num()  # (R,) what is remembered stays finite
+        misfit = error.detach().nan_to_num(0, 0, 0)  # (R,) what is remembered stays finite
         self.level.lerp_(misfit.median(), 0.02)
         if is_masking:
-            self.remember(rays, misfit, edge.nan_to_num())
+            self.remember(rays, misfit, edge.nan_to_num(0, 0, 0))
             if self.step % cfg.mask_every == 0:
                 total = total + self.mask_objective(pick)
         slot = (self.step * R + torch.arange(R, device=dev)) % len(self.hits)  # (R,)
-        self.hits[slot] = torch.cat([out["x"], ((1 - mask) * misfit)[:, None]], 1).nan_to_num(2.0)
+        self.hits[slot] = torch.cat([out["x"], ((1 - mask) * misfit)[:, None]], 1).nan_to_num(2, 2, 2)
         health = dict(zeta=self.deviation(), opacity=out["opacity"].mean(),
                       miss=1 - hit.float().mean(), mse=((out["rgb"] - rays.rgb) ** 2).mean())
         return total, {k: v.detach() for k, v in (raw | health).items()}

@@ -1,0 +1,3587 @@
+"""Tests of data_prep.py, then of geonvs.py in the order of the file.
+
+They come from properties: naive loops in float64, closed forms, limits, invariances, round trips; nothing
+needs data, network or a GPU, nothing is skipped, and no timing decides.
+"""
+import contextlib
+import copy
+import dataclasses
+import functools
+import http.server
+import io
+import itertools
+import json
+import math
+import re
+import shutil
+import struct
+import sys
+import tarfile
+import threading
+import types
+from pathlib import Path
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+from hypothesis import HealthCheck, given, settings, strategies as st
+from torch import nn
+
+import data_prep
+import geonvs as g
+from data_prep import UserError
+
+# ---- data_prep.py ----------------------------------------------------------------------------------
+
+
+TINY_TOY = dict(size=32, photos=6, test=2)
+
+
+@functools.cache
+def toy(**knobs):
+    return data_prep.make_toy(**{**TINY_TOY, **knobs})
+
+
+def photo(scene, i, key="rgb"):
+    w, h = scene["wh"][i]
+    return scene[key][scene["start"][i]:scene["start"][i + 1]].reshape(h, w, *scene[key].shape[1:])
+
+
+def world(scene, x):
+    return x * scene["scale"] + scene["center"]
+
+
+def same(a, b, *keys):
+    return all(np.array_equal(a[k], b[k], equal_nan=np.asarray(a[k]).dtype.kind == "f") for k in keys or a)
+
+
+# ---- toy -------------------------------------------------------------------------------------------
+
+def test_toy_repeats_by_seed_and_differs_between_seeds():
+    again = data_prep.make_toy(**TINY_TOY)
+    assert same(toy(), again) and set(toy()) == set(again)
+    assert not np.array_equal(toy()["c2w"], toy(seed=1)["c2w"])
+
+
+def pixels_beyond(scene):
+    """Directions (P,3), origins (P,3) and colours (P,3) of all training rays that miss the unit sphere."""
+    for i in np.flatnonzero(~scene["is_test"]):
+        (w, h), c2w, (fx, fy, cx, cy) = scene["wh"][i], scene["c2w"][i], scene["K"][i]
+        for p, rgb in enumerate(scene["rgb"][scene["start"][i]:scene["start"][i + 1]]):
+            d = c2w[:, :3] @ [(p % w + .5 - cx) / fx, (p // w + .5 - cy) / fy, 1]
+            t = -(c2w[:, 3] @ d) / (d @ d)
+            if t < 0 or np.linalg.norm(c2w[:, 3] + t * d) > 1:
+                yield rgb / 255
+
+
+def test_background_is_one_colour_exactly_when_most_rays_beyond_the_sphere_agree():
+    assert np.isnan(toy()["bg_color"]).all()
+    assert (toy(background=False)["bg_color"] == 0).all() and (toy(background=False, occluders=.1)["bg_color"] == 0).all()
+    grey = dict(toy(background=False), rgb=np.maximum(toy(background=False)["rgb"], 51))
+    np.testing.assert_allclose(data_prep.statistics(grey)["bg_color"], 0.2)
+    seen = np.array(list(pixels_beyond(toy(background=False))))
+    assert len(seen) > 100 and (np.abs(seen) < .02).all(1).mean() > .6  # people stand before it
+
+
+def test_exposure_spread_is_what_was_added_to_whole_photos():
+    s = toy(exposure=0.0, occluders=0.0)
+    assert s["exposure_spread"] < 0.01
+    rgb, offset = s["rgb"].astype(float) * 0.5 + 64, np.random.default_rng(0).uniform(-40, 40, len(s["wh"]))
+    for i, (a, b) in enumerate(zip(s["start"], s["start"][1:])):
+        rgb[a:b] += offset[i]
+    found = data_prep.statistics(dict(s, rgb=rgb.round().astype(np.uint8)))["exposure_spread"]
+    assert 0.5 < found / (offset[~s["is_test"]] / 255).std() < 1.5
+
+
+def test_footprint_halves_with_twice_the_focal_length():
+    s = toy()
+    K = s["K"] * [2, 2, 1, 1]
+    np.testing.assert_allclose(data_prep.statistics(dict(s, K=K))["footprint"], s["footprint"] / 2)
+
+
+def test_scene_dictionary_keeps_its_contract(tmp_path):
+    s = toy()
+    data_prep.write_scene(tmp_path / "toy.npz", s)
+    with np.load(tmp_path / "toy.npz", allow_pickle=False) as f:
+        back = {k: f[k] for k in f}
+    assert same(s, back)
+    n, i, k, t = s["start"][-1], 8, len(s["points"]), len(s["track_photo"])
+    want = dict(rgb=("uint8", (n, 3)), start=("int64", (i + 1,)), wh=("int32", (i, 2)), K=("float64", (i, 4)),
+                c2w=("float64", (i, 3, 4)), near=("float32", (i,)), is_test=("bool", (i,)),
+                points=("float32", (k, 3)), track_photo=("int32", (t,)), track_point=("int32", (t,)),
+                center=("float64", (3,)), scale=("float64", ()), depth=("float16", (n,)), occluder=("bool", (n,)))
+    assert {key: (str(back[key].dtype), back[key].shape) for key in want} == want
+    assert back["name"].dtype.kind == "U" and len(set(back["name"])) == i
+    assert set(back) == set(want) | {"name", "info", "footprint", "exposure_spread", "bg_color"}
+    info = json.loads(str(back["info"]))
+    assert info["kind"] == "toy" and info["downscale"] == 1 and info["left_out"] == [] and info["size"] == 32
+    assert np.array_equal(np.diff(s["start"]), s["wh"].prod(1)) and s["is_test"].sum() == 2
+    assert (s["near"] > 0).all() and s["track_photo"].max() < i and s["track_point"].max() < k
+    r = s["c2w"][:, :, :3]
+    np.testing.assert_allclose(r @ r.transpose(0, 2, 1), np.tile(np.eye(3), (i, 1, 1)), atol=1e-12)
+    np.testing.assert_allclose(np.linalg.det(r), 1)
+    assert s["wh"].max() == 32 and len(set(map(tuple, s["wh"].tolist()))) > 1
+
+
+@pytest.mark.parametrize("background", [True, False])
+def test_depth_is_where_the_distance_function_vanishes(background):
+    s = toy(background=background)
+    for i in range(8):
+        w, h = s["wh"][i]
+        t = photo(s, i, "depth").ravel().astype(float)
+        hit = np.isfinite(t) & (t < 8)
+        x = s["c2w"][i, :, 3] + t[hit, None] * data_prep.rays(s["K"][i], s["c2w"][i], w, h)[hit]
+        assert hit.any() and np.abs(data_prep.toy_sdf(world(s, x), background)).max() < 8 * 2 ** -10 * s["scale"]
+        assert data_prep.toy_sdf(world(s, s["c2w"][i, :, 3])[None], background) > 0.05
+
+
+def random_rays(count=400, seed=3):
+    rng = np.random.default_rng(seed)
+    o = rng.normal(size=(count, 3)) * 2.2 + [0, 0, 1]
+    o[:, 2] = np.abs(o[:, 2]) + .05
+    o = o[data_prep.toy_sdf(o * data_prep.TOY_SCALE + data_prep.TOY_ORIGIN) > .05]
+    d = rng.normal([0, 0, .7], .6, o.shape) - o
+    return o, d / np.linalg.norm(d, axis=1, keepdims=True)
+
+
+@pytest.mark.parametrize("ground", [True, False])
+def test_tracer_agrees_with_sphere_tracing_by_the_distance_function(ground):
+    o, d = random_rays()
+    t, which = data_prep.trace(o, d, ground)
+    sdf = lambda x: data_prep.toy_sdf(x * data_prep.TOY_SCALE + data_prep.TOY_ORIGIN, ground) / data_prep.TOY_SCALE
+    march = np.zeros(len(o))
+    for _ in range(250):
+        march += np.where(march < 40, sdf(o + march[:, None] * d), 0)
+    hit = t < 20
+    assert np.abs(sdf(o + np.where(hit, t, 0)[:, None] * d)[hit]).max() < 1e-9
+    assert (march[hit] <= t[hit] + 1e-6).all()   # never behind the traced hit
+    assert (np.abs(march - t)[hit] < 1e-3).mean() > .97   # a grazing ray marches slowly
+    assert (march[t == np.inf] > 15).mean() > .97
+    assert len(set(which[hit])) > 12
+
+
+def test_sdf_is_positive_outside_and_grows_no_faster_than_distance():
+    rng = np.random.default_rng(0)
+    a = rng.uniform([-9, -3, 0], [9, 9, 3], (4000, 3)) * data_prep.TOY_SCALE + data_prep.TOY_ORIGIN
+    b = a + rng.normal(0, .4, a.shape)
+    for ground in (True, False):
+        gap = np.abs(data_prep.toy_sdf(a, ground) - data_prep.toy_sdf(b, ground)) / np.linalg.norm(a - b, axis=1)
+        assert gap.max() < 1 + 1e-9 and gap.max() > .9
+    below = np.array([[0, 0, -1.0]]) * data_prep.TOY_SCALE + data_prep.TOY_ORIGIN
+    assert data_prep.toy_sdf(below) < 0 < data_prep.toy_sdf(below, ground=False)
+    inside = np.array([[.03, .2, .5]]) * data_prep.TOY_SCALE + data_prep.TOY_ORIGIN   # of the hall
+    assert data_prep.toy_sdf(inside) < 0
+
+
+def test_part_distance_agrees_with_dense_surface_samples():
+    rng = np.random.default_rng(1)
+    x = rng.uniform(-1, 1, (300, 3))
+    for part in (np.array([1, .1, .2, .3, .3, .4, .4, .2, 0]), np.array([1, 0, 0, 0, .2, .5, 0, .3, 0]),
+                 np.array([2, .1, 0, 0, .4, .3, .1, np.inf, 0]), np.array([3, 0, .1, 0, .5, .5, .5, np.inf, 0])):
+        surface = rng.uniform(-.9, .9, (400_000, 3))
+        sdf = data_prep.part_sdf(part, surface)
+        surface = surface[np.abs(sdf) < .004]
+        brute = np.array([np.sqrt(((surface - p) ** 2).sum(1).min()) for p in x])
+        out = data_prep.part_sdf(part, x)
+        assert np.abs(np.abs(out) - brute)[out > 0].max() < .05
+
+
+@pytest.mark.parametrize("knobs", [{}, dict(seed=2), dict(background=False), dict(occluders=.3)])
+def test_unit_sphere_holds_the_landmark_and_little_else(knobs):
+    s = toy(**knobs)
+    x = np.random.default_rng(0).uniform([-1.2, -.8, 0], [1.2, .8, 2], (200_000, 3)) * data_prep.TOY_SCALE + data_prep.TOY_ORIGIN
+    inside = x[data_prep.toy_sdf(x, ground=False) < 0]
+    reach = np.linalg.norm((inside - s["center"]) / s["scale"], axis=1)
+    assert .75 < reach.max() < 1
+    assert (np.linalg.norm(s["points"], axis=1) < 1).mean() > .8
+
+
+def test_no_exposure_and_no_people_means_the_same_picture_of_the_same_thing():
+    plain = toy(exposure=0.0, occluders=0.0)
+    assert not plain["occluder"].any()
+    for other in (toy(exposure=0.0, occluders=.3), toy(exposure=0.0)):
+        assert same(plain, other, "K", "c2w", "depth") or not same(plain, other, "scale")
+        free = ~other["occluder"]
+        assert np.array_equal(plain["rgb"][free], other["rgb"][free]) and free.mean() < 1
+    varied = toy(exposure=1.0, occluders=0.0)
+    ratio = [photo(varied, i).mean() / photo(plain, i).mean() for i in range(8)]
+    assert np.std(ratio) > .03
+    wilder = [photo(toy(exposure=2.0, occluders=0.0), i).mean() / photo(plain, i).mean() for i in range(8)]
+    assert np.std(wilder) > 1.3 * np.std(ratio)
+
+
+def test_same_point_has_the_same_colour_in_two_photos_without_exposure():
+    s = toy(exposure=0.0, occluders=0.0, size=64, background=True)
+    colour = np.full((len(s["wh"]), len(s["points"]), 3), np.nan)
+    for i in range(8):
+        own = s["track_point"][s["track_photo"] == i]
+        uv, _ = data_prep.project(s["K"][i], s["c2w"][i], s["points"][own].astype(float))
+        w, h = s["wh"][i]
+        ok = ((uv > 0) & (uv < (w, h))).all(1)
+        u, v = uv[ok].astype(int).T
+        colour[i, own[ok]] = photo(s, i)[v, u]
+    pairs = np.isfinite(colour[:, :, 0]).sum(0) >= 2
+    within = np.nanstd(colour[:, pairs], axis=0).mean()
+    assert within < .5 * np.nanstd(colour)
+
+
+@pytest.mark.parametrize("share", [.05, .2, .5])
+def test_people_cover_the_asked_share_of_training_photos_only(share):
+    s = data_prep.make_toy(size=64 if share < .1 else 32, photos=24, test=3, occluders=share)
+    train = np.repeat(~s["is_test"], np.diff(s["start"]))
+    assert not s["occluder"][~train].any()
+    assert .75 * share < s["occluder"][train].mean() < 1.35 * share
+    each = [photo(s, i, "occluder").mean() for i in np.flatnonzero(~s["is_test"])]
+    assert max(each) > 1.3 * share and min(each) < .7 * share
+
+
+def test_pose_noise_moves_training_photos_by_that_many_pixels_and_no_test_photo():
+    knobs = dict(size=24, photos=40, test=3, occluders=0.0)
+    clean, noisy = data_prep.make_toy(**knobs), data_prep.make_toy(**knobs, pose_noise=2.0)
+    assert same(clean, noisy, "rgb", "K", "points", "scale")
+    x = np.zeros((1, 3)) - clean["center"] / clean["scale"] + (data_prep.TOY_ORIGIN + [0, 0, 2.5]) / clean["scale"]
+    shift = np.array([data_prep.project(k, a, x)[0][0] - data_prep.project(k, b, x)[0][0]
+                      for k, a, b in zip(clean["K"], clean["c2w"], noisy["c2w"])])
+    assert not shift[clean["is_test"]].any()
+    assert 1.5 < np.sqrt((shift[~clean["is_test"]] ** 2).sum(1).mean()) < 2.6
+    error = [json.loads(str(s["info"]))["reprojection_px"] for s in (clean, noisy)]
+    assert error[0] < .3 and error[1] > 1
+
+
+def test_points_lie_on_surfaces_but_for_noise_and_a_few_wild_ones():
+    s = data_prep.make_toy(size=48, photos=12, test=2)
+    miss = np.abs(data_prep.toy_sdf(world(s, s["points"].astype(float)))) / s["scale"]
+    assert .001 < np.median(miss) < .006 and .0005 < (miss > .03).mean() < .05
+    assert len(s["points"]) > 1000 and np.bincount(s["track_point"]).min() >= 2
+    hidden = 0
+    for i in range(14):
+        own = s["points"][s["track_point"][s["track_photo"] == i]].astype(float)
+        uv, distance = data_prep.project(s["K"][i], s["c2w"][i], own)
+        u, v = np.clip(uv.astype(int), 0, s["wh"][i] - 1).T
+        hidden += (photo(s, i, "depth")[v, u] < .8 * distance).sum()
+        assert (distance > s["near"][i]).mean() > .95
+    assert hidden < .06 * len(s["track_photo"])   # wild points, and the noise at outlines
+
+
+def test_nothing_but_the_landmark_without_background():
+    s = toy(background=False, occluders=0.0, exposure=2.0)
+    sky = np.isinf(s["depth"])
+    edge = 0
+    for i in range(8):   # supersampling mixes the colours at outlines: look one pixel away from them
+        far = cv2.erode(np.isinf(photo(s, i, "depth")).astype(np.uint8), np.ones((3, 3)))
+        edge += far.sum()
+        assert not photo(s, i)[far > 0].any()
+    assert edge > .2 * sky.sum() and sky.mean() > .3
+
+
+@pytest.mark.parametrize("bad", [dict(occluders=.7), dict(exposure=-1), dict(size=4), dict(photos=1),
+                                 dict(pose_noise=-1), dict(seed=-1), dict(test=-1)])
+def test_toy_refuses_senseless_knobs(bad):
+    with pytest.raises(UserError, match="toy needs"):
+        data_prep.make_toy(**{**TINY_TOY, **bad})
+
+
+def test_toy_without_test_photos():
+    assert not data_prep.make_toy(**{**TINY_TOY, "test": 0})["is_test"].any()
+
+
+# ---- COLMAP ------------------------------------------------------------------------------------------
+
+def write_colmap(folder, cameras, images, points):
+    """Independent writer. cameras {id: (model, w, h, params)}, images [(id, q, t, camera id, name, obs)],
+    points [(id, xyz, error, track)]."""
+    folder.mkdir(parents=True, exist_ok=True)
+    with open(folder / "cameras.bin", "wb") as f:
+        f.write(struct.pack("<Q", len(cameras)))
+        for key, (model, w, h, p) in cameras.items():
+            f.write(struct.pack("<iiQQ", key, model, w, h) + struct.pack(f"<{len(p)}d", *p))
+    with open(folder / "images.bin", "wb") as f:
+        f.write(struct.pack("<Q", len(images)))
+        for key, q, t, camera, name, obs in images:
+            f.write(struct.pack("<I4d3dI", key, *q, *t, camera) + name.encode() + b"\0")
+            f.write(struct.pack("<Q", len(obs)) + b"".join(struct.pack("<ddQ", *o) for o in obs))
+    with open(folder / "points3D.bin", "wb") as f:
+        f.write(struct.pack("<Q", len(points)))
+        for key, x, error, track in points:
+            f.write(struct.pack("<Q3d3BdQ", key, *x, 1, 2, 3, error, len(track)))
+            f.write(b"".join(struct.pack("<II", *o) for o in track))
+
+
+def quaternion(r):
+    w = np.sqrt(max(0, 1 + np.trace(r))) / 2
+    if w > 1e-3:
+        return np.array([w, *(np.array([r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]]) / (4 * w))])
+    x = cv2.Rodrigues(r)[0].ravel()
+    angle = np.linalg.norm(x)
+    return np.array([np.cos(angle / 2), *(np.sin(angle / 2) * x / angle)])
+
+
+def as_colmap(folder, scene, model=1, sub="dense", table=True, name=lambda n: n, distort=None):
+    """The toy written as if COLMAP had posed its photos."""
+    cameras, images, tracks = {}, [], {}
+    x = world(scene, scene["points"].astype(float))
+    for i, n in enumerate(scene["name"]):
+        w, h = map(int, scene["wh"][i])
+        fx, fy, cx, cy = scene["K"][i]
+        k = distort or ()
+        cameras[3 * i + 7] = (model, w, h, (fx, fy, cx, cy, *k) if model in (1, 4) else (fx, cx, cy, *k))
+        r = scene["c2w"][i, :, :3].T
+        centre = world(scene, scene["c2w"][i, :, 3])
+        own = scene["track_point"][scene["track_photo"] == i]
+        p = (x[own] - centre) @ r.T
+        uv = p[:, :2] / p[:, 2:] * (fx, fy) + (cx, cy)
+        obs = []
+        for j, (point, at) in enumerate(zip(own, uv)):
+            obs.append((*at, 5 * int(point) + 2 ** 40))
+            tracks.setdefault(int(point), []).append((i + 50, j))
+        obs.append((1.0, 1.0, 2 ** 64 - 1))
+        images.append((i + 50, 2.5 * quaternion(r), -r @ centre, 3 * i + 7, name(str(n)), obs))
+        path = folder / sub / "images" / name(str(n))
+        path.parent.mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(path), photo(scene, i)[..., ::-1])
+    points = [(5 * k + 2 ** 40, x[k], .5, track) for k, track in tracks.items()]
+    write_colmap(folder / sub / "sparse", cameras, images[::-1], points)
+    if table:
+        rows = [f"{j}.0\t{'test' if scene['is_test'][j] else 'train'}\t{name(str(n))}\ttoy"
+                for j, n in enumerate(scene["name"])]
+        (folder / "toy.tsv").write_text("\n".join(["id\tsplit\tfilename\tdataset", *rows]) + "\n")
+    return cameras, images, points
+
+
+@pytest.fixture(scope="module")
+def source():
+    return data_prep.make_toy(size=40, photos=8, test=2)
+
+
+@pytest.fixture
+def folder(tmp_path, source):
+    as_colmap(tmp_path / "place", source)
+    return tmp_path / "place"
+
+
+def test_colmap_model_comes_back(tmp_path):
+    rng = np.random.default_rng(0)
+    q, t = rng.normal(size=(3, 4)) * 3, rng.normal(size=(3, 3))
+    names = ["b c/photo 1.jpg", "a.png", "Ünïcode.jpg"]
+    cameras = {9: (0, 30, 20, (25., 15., 10.)), 2 ** 31 - 1: (4, 31, 21, (25., 26., 15., 10., .1, .2, .3, .4)),
+               4: (3, 9, 8, (5., 4., 3., .01, .02)), 5: (2, 9, 8, (5., 4., 3., .01))}
+    images = [(100 + 7 * i, q[i], t[i], (9, 2 ** 31 - 1, 9)[i], names[i],
+               [(1.5 + i, 2.5, 2 ** 63 + 5), (3., 4., 2 ** 64 - 1), (5., 6., 17)]) for i in range(3)]
+    points = [(2 ** 63 + 5, (1., 2., 3.), .7, [(100, 0), (107, 0)]), (17, (4., 5., 6.), .1, [])]
+    write_colmap(tmp_path, cameras, images, points)
+    got, photos, p = data_prep.read_colmap(tmp_path)
+    ids, xyz, error, views = p["id"], p["xyz"], p["error"], p["views"]
+    assert [tuple(map(float, got[9][2])), got[9][0], got[9][1]] == [(25, 25, 15, 10), 30, 20]
+    assert list(got[2 ** 31 - 1][2]) == [25, 26, 15, 10] and list(got[2 ** 31 - 1][3]) == [.1, .2, .3, .4]
+    assert list(got[4][3]) == [.01, .02, 0, 0] and list(got[5][3]) == [.01, 0, 0, 0]
+    assert list(photos) == names and [photos[n][0] for n in names] == [9, 2 ** 31 - 1, 9]
+    assert list(ids) == [2 ** 63 + 5, 17] and views.tolist() == [2, 0] and error.tolist() == [.7, .1]
+    np.testing.assert_array_equal(xyz, [[1, 2, 3], [4, 5, 6]])
+    for i, n in enumerate(names):
+        _, c2w, uv, seen = photos[n]
+        w, *v = q[i] / np.linalg.norm(q[i])
+        p = rng.normal(size=3)
+        turned = p + 2 * w * np.cross(v, p) + 2 * np.cross(v, np.cross(v, p))   # q p q*, by vectors
+        np.testing.assert_allclose(c2w[:, :3] @ (turned + t[i]) + c2w[:, 3], p, atol=1e-12)
+        assert seen.tolist() == [2 ** 63 + 5, 17] and uv.tolist() == [[1.5 + i, 2.5], [5., 6.]]
+
+
+@pytest.mark.parametrize("sub", ["dense", "."])
+def test_toy_survives_the_way_through_colmap_files(tmp_path, source, sub):
+    as_colmap(tmp_path, source, sub=sub)
+    s = data_prep.prepare(tmp_path, downscale=1)
+    assert json.loads(str(s["info"]))["reprojection_px"] < .01
+    assert same(s, source, "rgb", "is_test", "name", "wh", "start")
+    np.testing.assert_allclose(s["K"], source["K"])
+    np.testing.assert_allclose(s["c2w"][:, :, :3], source["c2w"][:, :, :3], atol=1e-9)
+    np.testing.assert_allclose(world(s, s["c2w"][:, :, 3]), world(source, source["c2w"][:, :, 3]), atol=1e-9)
+    assert len(s["points"]) > .9 * len(source["points"])
+    uv, _ = data_prep.project(s["K"][0], s["c2w"][0], s["points"][s["track_point"][s["track_photo"] == 0]].astype(float))
+    assert ((uv > -1) & (uv < s["wh"][0] + 1)).all(1).mean() > .95
+    (tmp_path / sub / "sparse" / "0").mkdir()
+    for f in (tmp_path / sub / "sparse").glob("*.bin"):
+        f.rename(f.parent / "0" / f.name)
+    assert same(data_prep.prepare(tmp_path, downscale=1), s)
+
+
+def test_shared_cameras_are_found_through_the_camera_id(tmp_path, source):
+    cameras, images, points = as_colmap(tmp_path, source)
+    images = [(cam_id, *rest) for (_, *rest), cam_id in zip(images, np.roll([i[0] for i in images], 3))]
+    write_colmap(tmp_path / "dense" / "sparse", cameras, images, points)   # image ids mean nothing
+    np.testing.assert_allclose(data_prep.prepare(tmp_path, 1)["K"], source["K"])
+
+
+def test_downscaled_intrinsics_are_exact_for_odd_sizes(tmp_path, source):
+    as_colmap(tmp_path, source)
+    s = data_prep.prepare(tmp_path, downscale=3)
+    assert (source["wh"] % 3).any()
+    np.testing.assert_array_equal(s["wh"], source["wh"] // 3)
+    ratio = s["wh"] / source["wh"]
+    np.testing.assert_allclose(s["K"], source["K"] * np.tile(ratio, 2))
+    np.testing.assert_allclose(s["K"][:, 2:] * 2, s["wh"])   # the middle stays the middle
+    assert json.loads(str(s["info"]))["reprojection_px"] < .01
+
+
+def test_a_wrong_convention_shows_in_the_reprojection_error(tmp_path, source):
+    cameras, images, points = as_colmap(tmp_path, source)
+    flipped = [(k, q * [1, -1, -1, -1], *rest) for k, q, *rest in images]   # camera to world, mistaken
+    write_colmap(tmp_path / "dense" / "sparse", cameras, flipped, points)
+    assert json.loads(str(data_prep.prepare(tmp_path, 1)["info"]))["reprojection_px"] > 5
+
+
+@pytest.mark.parametrize("model, k", [(2, (-.15,)), (3, (-.15, .05)), (4, (-.12, .03, .01, -.01))])
+def test_distorted_photos_are_undistorted(tmp_path, model, k):
+    source = data_prep.make_toy(size=96, photos=4, test=0, occluders=0.0)
+    cameras, images, points = as_colmap(tmp_path, source, model=model, distort=k, table=False)
+    bend = np.append(k, np.zeros(4))[:4]
+    for i, (key, q, t, camera, name, obs) in enumerate(images):
+        fx, fy, cx, cy = source["K"][i]
+
+        def distorted(x, y):   # COLMAP's formula, by hand
+            r2, (k1, k2, p1, p2) = x * x + y * y, bend
+            radial = 1 + k1 * r2 + k2 * r2 * r2
+            return (x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+                    y * radial + 2 * p2 * x * y + p1 * (r2 + 2 * y * y))
+        uv = np.array([o[:2] for o in obs])
+        x, y = distorted((uv[:, 0] - cx) / fx, (uv[:, 1] - cy) / fy)
+        obs[:] = [(a * fx + cx, b * fy + cy, o[2]) for a, b, o in zip(x, y, obs)]
+        w, h = source["wh"][i]
+        v, u = np.mgrid[:h, :w] + .5
+        x0, y0 = (u - cx) / fx, (v - cy) / fy
+        x, y = x0.copy(), y0.copy()
+        for _ in range(50):   # where the straight photo shows what the bent one has at (u, v)
+            dx, dy = distorted(x, y)
+            x, y = x + x0 - dx, y + y0 - dy
+        bent = cv2.remap(photo(source, i), (x * fx + cx - .5).astype(np.float32),
+                         (y * fy + cy - .5).astype(np.float32), cv2.INTER_LINEAR)
+        cv2.imwrite(str(tmp_path / "dense" / "images" / name), bent[..., ::-1])
+    write_colmap(tmp_path / "dense" / "sparse", cameras, images, points)
+    s = data_prep.prepare(tmp_path, 1)
+    assert json.loads(str(s["info"]))["reprojection_px"] < .01
+    for i in range(4):
+        a, b = photo(s, i).astype(float), photo(source, i).astype(float)
+        middle = tuple(slice(n // 6, -n // 6) for n in a.shape[:2])
+        error = lambda image: np.abs(image - b)[middle].mean()
+        shifted = min(error(np.roll(a, 1, axis)) for axis in (0, 1))
+        assert error(a) < .6 * shifted
+
+
+def test_foreground_sphere_ignores_wild_points_and_prefers_what_many_see():
+    rng = np.random.default_rng(0)
+    x = rng.normal(size=(2000, 3))
+    x *= (rng.random((2000, 1)) ** (1 / 3)) / np.linalg.norm(x, axis=1, keepdims=True)   # a unit ball
+    far = rng.normal([40, 0, 0], 3, (300, 3))
+    xyz, views = np.concatenate([x, far]), np.repeat([20, 3], [2000, 300])
+    photos, point = np.zeros(2000, int), np.arange(2000)
+
+    def sphere(xyz, views, is_train=np.ones(1, bool)):
+        table = np.zeros(len(xyz), data_prep.POINT)
+        table["xyz"], table["views"] = xyz, views
+        return data_prep.foreground_sphere(table, photos, point, is_train)
+    centre, radius, usable = sphere(xyz, views)
+    assert np.linalg.norm(centre) < .05 and .95 < radius < 1.15 and usable.all()
+    moved = sphere(xyz * 3 + [5, 6, 7], views)
+    np.testing.assert_allclose(moved[0], centre * 3 + [5, 6, 7], atol=1e-6)
+    np.testing.assert_allclose(moved[1], 3 * radius, rtol=1e-6)
+    xyz[5], views[6] = np.inf, 2
+    assert not sphere(xyz, views)[2][[5, 6]].any()
+    equal = sphere(xyz, np.full(2300, 20))
+    assert equal[1] > 20   # without weights the far points would count
+    xyz, views = np.concatenate([x, far]), np.repeat([20, 3], [2000, 300])
+    photos = np.repeat([0, 1, 2], [100, 150, 150])   # two of three look elsewhere: they must see it too
+    point = np.concatenate([np.arange(100), 2000 + np.arange(150), 2150 + np.arange(150)])
+    assert sphere(xyz, views, np.ones(3, bool))[1] > 30
+    assert sphere(xyz, views, np.array([True, False, False]))[1] < 1.2   # test photos have no say
+
+
+# ---- splits, photos, and what can be wrong with them -------------------------------------------------
+
+def test_split_is_read_by_column_name(tmp_path):
+    want = {"a b.jpg": "test", "sub/c.jpg": "train"}
+    for text in ("filename\tid\tsplit\tdataset\na b.jpg\t1.0\ttest\tx\nsub/c.jpg\t2.0\ttrain\tx\nno.jpg\t\ttrain\tx\n",
+                 "id\tsplit\tfilename\tdataset\r\n1\ttest\ta b.jpg\tx\r\n2\ttrain\tsub/c.jpg\tx\r\n",
+                 "\tsplit\tnima\tfilename\n0\ttest\t5.1\ta b.jpg\n1\ttrain\t4\tsub/c.jpg\n"):
+        (tmp_path / "s.tsv").write_bytes(text.encode())
+        assert data_prep.read_split(tmp_path / "s.tsv") == want
+
+
+@pytest.mark.parametrize("text, says", [
+    ("", "header"), ("filename\tid\n", "header"), ("a,b\n", "header"),
+    ("filename\tsplit\n../x.jpg\ttrain\n", "outside"), ("filename\tsplit\n/etc/x.jpg\ttrain\n", "outside"),
+    ("filename\tsplit\n\ttrain\n", "outside"), ("filename\tsplit\nx.jpg\tvalid\n", "train or test"),
+    ("filename\tsplit\nx.jpg\n", "train or test"), ("filename\tsplit\nx\ttrain\nx\ttest\n", "not both")])
+def test_bad_splits_are_named(tmp_path, text, says):
+    (tmp_path / "s.tsv").write_text(text)
+    with pytest.raises(UserError, match=says) as e:
+        data_prep.read_split(tmp_path / "s.tsv")
+    assert "s.tsv" in str(e.value)
+
+
+def run_main(*argv):
+    """Exit code, stdout, stderr of the command line."""
+    out, err, code = io.StringIO(), io.StringIO(), 0
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        try:
+            data_prep.main(list(map(str, argv)))
+        except SystemExit as e:
+            code = e.code
+    return code, out.getvalue(), err.getvalue()
+
+
+def test_every_eighth_photo_is_held_out_without_a_split(folder, capsys):
+    (folder / "toy.tsv").unlink()
+    s = data_prep.prepare(folder)
+    assert np.flatnonzero(s["is_test"]).tolist() == [7] and list(s["name"]) == sorted(s["name"])
+    assert "every eighth" in capsys.readouterr().err
+
+
+def test_photos_left_out_are_reported(folder, capsys):
+    rows = (folder / "toy.tsv").read_text().splitlines()
+    (folder / "toy.tsv").write_text("\n".join(rows[:-1] + ["9\ttrain\tghost.jpg\ttoy"]))
+    (folder / "dense" / "images" / "toy_000.png").unlink()
+    s = data_prep.prepare(folder)
+    said, info = capsys.readouterr().err, json.loads(str(s["info"]))
+    assert len(s["name"]) == 8 and not {"toy_000.png", "toy_009.png"} & set(s["name"])
+    assert len(info["left_out"]) == 3 and all(line in said for line in info["left_out"])
+    assert "toy_000.png" in said and "toy_009.png" in said and "ghost.jpg" in said
+    assert s["track_photo"].max() == 7
+
+
+def test_split_without_test_rows_is_fine_and_said(folder, capsys):
+    table = folder / "toy.tsv"
+    table.write_text(table.read_text().replace("\ttest\t", "\ttrain\t"))
+    assert not data_prep.prepare(folder)["is_test"].any() and "null" in capsys.readouterr().err
+
+
+def test_grey_cmyk_and_rotated_photos(folder):
+    from PIL import Image
+    images = folder / "dense" / "images"
+    for i, mode in enumerate(("L", "CMYK", "P", "RGBA")):
+        path = images / f"toy_{i:03d}.png"
+        image = Image.open(path).convert("RGB").convert(mode)
+        image.save(path, "TIFF" if mode == "CMYK" else "PNG")
+    exif = Image.Exif()
+    exif[274] = 6   # turned by 90 degrees, which must be ignored
+    Image.open(images / "toy_004.png").save(images / "toy_004.png", "JPEG", exif=exif, quality=98)
+    assert len(data_prep.prepare(folder)["name"]) == 10
+
+
+def test_cmyk_jpeg_keeps_its_colours(folder):
+    from PIL import Image
+    path = folder / "dense" / "images" / "toy_000.png"
+    before = photo(data_prep.prepare(folder, 1), 0).astype(float)
+    Image.open(path).convert("CMYK").save(path, "JPEG", quality=95)
+    assert np.abs(photo(data_prep.prepare(folder, 1), 0) - before).mean() < 12
+
+
+def damage_file(folder, source, what):
+    """Breaks one thing in a good folder."""
+    cameras, images, points = as_colmap(folder, source)
+    sparse, first = folder / "dense" / "sparse", folder / "dense" / "images" / "toy_000.png"
+    image = dict((i[4], list(i)) for i in images)
+    if what == "fisheye":
+        cameras[7] = (5, *cameras[7][1:3], (30.,) * 8)
+    if what == "unknown model":
+        cameras[7] = (77, *cameras[7][1:])
+    if what == "nan pose":
+        image["toy_000.png"][1] = np.full(4, np.nan)
+    if what == "zero quaternion":
+        image["toy_000.png"][1] = np.zeros(4)
+    if what == "infinite position":
+        image["toy_000.png"][2] = np.full(3, np.inf)
+    if what == "negative focal":
+        cameras[7] = (1, *cameras[7][1:3], (-30., 30., 20., 15.))
+    if what == "no such camera":
+        image["toy_000.png"][3] = 12345
+    if what == "twice the same":
+        image["toy_001.png"][4] = "toy_000.png"
+    if what == "escaping name":
+        image["toy_000.png"][4] = "../toy_000.png"
+    write_colmap(sparse, cameras, list(image.values()), [] if what == "no points" else points)
+    if what == "points at one place":
+        write_colmap(sparse, cameras, list(image.values()), [(k, (1., 2., 3.), e, t) for k, _, e, t in points])
+    if what == "points at infinity":
+        write_colmap(sparse, cameras, list(image.values()), [(k, (np.inf,) * 3, e, t) for k, _, e, t in points])
+    if what == "size":
+        cv2.imwrite(str(first), np.zeros((7, 9, 3), np.uint8))
+    if what == "not a photo":
+        first.write_text("no photo")
+    if what == "empty photo":
+        first.write_bytes(b"")
+    if what == "missing file":
+        (sparse / "images.bin").unlink()
+    if what == "empty file":
+        (sparse / "points3D.bin").write_bytes(b"")
+    if what == "two splits":
+        (folder / "other.tsv").write_text((folder / "toy.tsv").read_text())
+    if what == "no train":
+        (folder / "toy.tsv").write_text((folder / "toy.tsv").read_text().replace("\ttrain\t", "\ttest\t"))
+    if what == "no images":
+        (folder / "dense" / "images").rename(folder / "dense" / "elsewhere")
+
+
+CASES = {"fisheye": "image_undistorter", "unknown model": "image_undistorter", "nan pose": "toy_000.png",
+         "zero quaternion": "toy_000.png", "infinite position": "toy_000.png", "negative focal": "camera 7",
+         "no such camera": "toy_000.png", "twice the same": "toy_000.png", "escaping name": "outside",
+         "no points": "overlapping", "points at one place": "coincide", "points at infinity": "overlapping",
+         "size": "toy_000.png",
+         "not a photo": "toy_000.png", "empty photo": "toy_000.png", "missing file": "images.bin",
+         "empty file": "points3D.bin", "two splits": "--split", "no train": "split file", "no images": "--sfm"}
+
+
+@pytest.mark.parametrize("what", CASES)
+def test_bad_input_gives_one_line_and_exit_code_2(tmp_path, source, what):
+    damage_file(tmp_path / "place", source, what)
+    with np.errstate(all="raise"):
+        code, out, err = run_main(tmp_path / "place", "--out", tmp_path / "x.npz")
+    assert code == 2 and out == "" and err.count("\n") == 1 and err.startswith("error: ")
+    assert CASES[what] in err and not (tmp_path / "x.npz").exists()
+
+
+def test_very_narrow_and_very_wide_photos_are_left_out(tmp_path, source):
+    cameras, images, points = as_colmap(tmp_path, source)
+    for key, f in ((7, 1000.), (10, 3.)):
+        cameras[key] = (1, *cameras[key][1:3], (f, f, *cameras[key][3][2:]))
+    write_colmap(tmp_path / "dense" / "sparse", cameras, images, points)
+    s = data_prep.prepare(tmp_path)
+    assert list(s["name"]) == list(source["name"][2:]) and "toy_000.png, toy_001.png" in str(s["info"])
+
+
+# ---- random damage_file -----------------------------------------------------------------------------------
+
+QUICK = settings(max_examples=60, deadline=2000, derandomize=True,
+                 suppress_health_check=[HealthCheck.function_scoped_fixture])
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("model")
+    points = [(i, (float(i), 1., 2.), .5, [(1, 0), (2, 0)]) for i in range(3)]
+    obs = [(1., 2., i) for i in range(3)]
+    write_colmap(folder, {1: (1, 8, 6, (9., 9., 4., 3.)), 2: (2, 8, 6, (9., 4., 3., .1))},
+                 [(1, (1., 0, 0, 0), (0., 0, 0), 1, "a b.jpg", obs), (2, (1., .1, 0, 0), (1., 0, 0), 2, "c.jpg", obs)],
+                 points)
+    return folder, {f.name: f.read_bytes() for f in folder.glob("*.bin")}
+
+
+def survives(model, name, data):
+    folder, good = model
+    (folder / name).write_bytes(data)
+    try:
+        data_prep.read_colmap(folder)
+        return True
+    except UserError as e:
+        assert "\n" not in str(e)
+        return False
+    finally:
+        (folder / name).write_bytes(good[name])
+
+
+BINS = ["cameras.bin", "images.bin", "points3D.bin"]
+
+
+@pytest.mark.parametrize("name", BINS)
+def test_truncation_anywhere_is_noticed(model, name):
+    data = model[1][name]
+    assert survives(model, name, data)
+    assert not any(survives(model, name, data[:n]) for n in range(len(data)))
+
+
+@pytest.mark.parametrize("name", BINS)
+@QUICK
+@given(data=st.data())
+def test_random_and_flipped_bytes_do_no_harm(model, name, data):
+    good = bytearray(model[1][name])
+    for at in data.draw(st.lists(st.integers(0, 8 * len(good) - 1), max_size=4)):
+        good[at // 8] ^= 1 << at % 8
+    survives(model, name, bytes(good))
+    survives(model, name, data.draw(st.binary(max_size=200)))
+    small = struct.pack("<Q", data.draw(st.integers(0, 3)))
+    survives(model, name, small + data.draw(st.binary(max_size=200)))
+
+
+@pytest.mark.parametrize("name", BINS)
+@pytest.mark.parametrize("count", [4, 1000, 2 ** 31, 2 ** 40, 2 ** 63, 2 ** 64 - 1])
+def test_promised_counts_are_checked_before_memory_is_taken(model, name, count):
+    data = model[1][name]
+    assert not survives(model, name, struct.pack("<Q", count) + data[8:])
+    at = {"images.bin": data.find(b"a b.jpg\0") + 8, "points3D.bin": 8 + 43}.get(name)   # of the first record
+    if at:
+        assert not survives(model, name, data[:at] + struct.pack("<Q", count) + data[at + 8:])
+
+
+@QUICK
+@given(text=st.one_of(st.binary(max_size=200), st.text(max_size=200).map(lambda s: s.encode("utf-8", "ignore"))))
+def test_random_tables_do_no_harm(tmp_path, text):
+    for head in (b"", b"filename\tid\tsplit\n"):
+        (tmp_path / "s.tsv").write_bytes(head + text)
+        try:
+            split = data_prep.read_split(tmp_path / "s.tsv")
+        except UserError:
+            continue
+        assert set(split.values()) <= {"train", "test"} and not any(".." in n.split("/") for n in split)
+
+
+# ---- writing, download, command line -----------------------------------------------------------------
+
+@pytest.mark.parametrize("error", [OSError(28, "No space left on device"), KeyboardInterrupt(), ValueError("x")])
+def test_failed_write_leaves_the_old_file_and_nothing_else(tmp_path, error):
+    path = tmp_path / "sub" / "scene.npz"
+    data_prep.atomic_write(path, lambda part: part.write_text("old"))
+
+    def write(part):
+        assert part.suffix == ".npz" and part.parent == path.parent
+        part.write_text("half")
+        raise error
+    with pytest.raises(UserError if isinstance(error, OSError) else type(error)) as e:
+        data_prep.atomic_write(path, write)
+    assert path.read_text() == "old" and [p.name for p in path.parent.iterdir()] == ["scene.npz"]
+    if isinstance(error, OSError):
+        assert "scene.npz" in str(e.value) and "No space" in str(e.value)
+    with pytest.raises(UserError):
+        data_prep.atomic_write(path, lambda part: False)
+    with pytest.raises(UserError):
+        data_prep.atomic_write(path / "below a file.png", lambda part: part.write_text("x"))
+
+
+class Server(http.server.BaseHTTPRequestHandler):
+    """Ranges, or not; breaks off after `limit` bytes of an answer."""
+    files, ranges, limit, asked = {}, True, None, []
+
+    def do_GET(self):
+        cls, data = type(self), type(self).files.get(self.path)
+        start = int(self.headers.get("Range", "bytes=0-")[6:-1]) if cls.ranges else 0
+        cls.asked.append((self.path, self.headers.get("Range")))
+        if data is None:
+            return self.send_error(404)
+        if start >= len(data) > 0 and start:
+            return self.send_error(416)
+        self.send_response(206 if start else 200)
+        self.send_header("Content-Length", str(len(data) - start))
+        self.end_headers()
+        self.wfile.write(data[start:][:cls.limit])
+
+    def log_message(self, *_):
+        pass
+
+
+def archive(members):
+    out = io.BytesIO()
+    with tarfile.open(fileobj=out, mode="w:gz") as tar:
+        for name, content in members:
+            info = tarfile.TarInfo(name)
+            if isinstance(content, str):
+                info.type, info.linkname = tarfile.SYMTYPE, content
+                tar.addfile(info)
+            else:
+                info.size = len(content)
+                tar.addfile(info, io.BytesIO(content))
+    return out.getvalue()
+
+
+PLACE = "brandenburg_gate/dense/"
+GOOD = [(PLACE + "images/a.jpg", np.random.default_rng(0).bytes(50_000)), (PLACE + "sparse/cameras.bin", b"x"),
+        (PLACE + "stereo/big.bin", b"y"), ("brandenburg_gate/other.txt", b"z")]
+
+
+@pytest.fixture
+def server(tmp_path):
+    handler = type("Handler", (Server,), dict(asked=[]))
+    handler.files = {"/t/brandenburg_gate.tar.gz": archive(GOOD), "/s/brandenburg.tsv": b"filename\tsplit\n"}
+    web = http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler)
+    threading.Thread(target=web.serve_forever, args=(.02,), daemon=True).start()
+    base = f"http://127.0.0.1:{web.server_port}"
+    handler.get = lambda: data_prep.download("brandenburg", tmp_path / "data", base + "/t/", base + "/s/")
+    yield handler
+    web.shutdown()
+    web.server_close()
+
+
+def unpacked(tmp_path):
+    root = tmp_path / "data" / "brandenburg"
+    return sorted(str(p.relative_to(root)) for p in root.rglob("*") if p.is_file())
+
+
+def test_download_unpacks_photos_model_and_split_only(server, tmp_path):
+    server.get()
+    assert unpacked(tmp_path) == ["brandenburg.tsv", "dense/images/a.jpg", "dense/sparse/cameras.bin"]
+    assert (tmp_path / "data/brandenburg/dense/images/a.jpg").read_bytes() == GOOD[0][1]
+    assert not [p for p in (tmp_path / "data").iterdir() if p.name.startswith(".") or p.suffix == ".part"]
+    asked = len(server.asked)
+    server.get()
+    assert len(server.asked) == asked   # nothing is fetched twice
+
+
+@pytest.mark.parametrize("ranges", [True, False])
+def test_broken_download_goes_on_where_it_stopped(server, tmp_path, ranges):
+    server.limit, server.ranges = 20_000, ranges
+    with pytest.raises(UserError, match="same command"):
+        server.get()
+    part = tmp_path / "data" / "brandenburg_gate.tar.gz.part"
+    assert part.stat().st_size == 20_000 and not (tmp_path / "data" / "brandenburg").exists()
+    server.limit = None
+    server.get()
+    assert ("/t/brandenburg_gate.tar.gz", "bytes=20000-") in server.asked and not part.exists()
+    assert (tmp_path / "data/brandenburg_gate.tar.gz").read_bytes() == server.files["/t/brandenburg_gate.tar.gz"]
+    assert len(unpacked(tmp_path)) == 3
+
+
+def test_a_part_longer_than_the_file_is_started_over(server, tmp_path):
+    part = tmp_path / "data" / "brandenburg_gate.tar.gz.part"
+    part.parent.mkdir()
+    part.write_bytes(b"?" * 200_000)
+    with pytest.raises(UserError):
+        server.get()
+    server.get()
+    assert len(unpacked(tmp_path)) == 3
+
+
+def test_missing_file_and_dead_server_are_said(server, tmp_path):
+    server.files = {}
+    with pytest.raises(UserError, match="404"):
+        server.get()
+    with pytest.raises(UserError, match="127.0.0.1"):
+        data_prep.download("brandenburg", tmp_path / "d", "http://127.0.0.1:9/", "http://127.0.0.1:9/")
+    with pytest.raises(UserError, match="--download knows"):
+        data_prep.download("nowhere", tmp_path / "d")
+
+
+@pytest.mark.parametrize("evil", [
+    (PLACE + "images/../../../../evil.txt", b"x"), ("/evil.txt", b"x"), ("../evil.txt", b"x"),
+    (PLACE + "images/link", "/etc"), (PLACE + "images/link", "a.jpg"), (PLACE + "images/link", "../../../.."), ("brandenburg_gate/dense/images", "/tmp")])
+def test_archives_cannot_write_outside(server, tmp_path, evil):
+    server.files["/t/brandenburg_gate.tar.gz"] = archive(
+        [*GOOD, evil] + [(PLACE + "images/link/evil.txt", b"x")] * (evil[1] != "a.jpg"))
+    try:
+        server.get()
+    except UserError as e:
+        assert "unpack" in str(e)
+    assert not [p for p in tmp_path.rglob("*") if p.is_symlink()]
+    inside = tmp_path / "data" / "brandenburg"
+    assert all(inside in p.parents for p in tmp_path.rglob("evil.txt"))
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["data"]
+
+
+@pytest.mark.parametrize("damage_file", [lambda b: b[:30_000], lambda b: b"no archive", lambda b: b[:9000] + b"?" * 99 + b[9099:]])
+def test_damaged_archives_are_named_and_leave_nothing(server, tmp_path, damage_file):
+    server.files["/t/brandenburg_gate.tar.gz"] = damage_file(server.files["/t/brandenburg_gate.tar.gz"])
+    with pytest.raises(UserError, match="brandenburg_gate.tar.gz"):
+        server.get()
+    assert sorted(p.name for p in (tmp_path / "data").iterdir()) == ["brandenburg.tsv", "brandenburg_gate.tar.gz"]
+
+
+def test_locate_and_prepare_finds_the_archive_or_names_the_command(tmp_path, source):
+    with pytest.raises(UserError, match="python data_prep.py sacre --download"):
+        data_prep.locate_and_prepare("sacre", tmp_path)
+    for folder in ("sacre_coeur", "sacre"):   # unpacked by hand, or by --download
+        as_colmap(tmp_path / folder, source)
+        s = data_prep.locate_and_prepare("sacre", tmp_path, downscale=2)
+        assert np.array_equal(s["wh"], source["wh"] // 2) and folder in str(s["info"])
+
+
+def test_command_line_makes_a_toy_and_reads_a_folder(tmp_path, source, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    code, out, _ = run_main("toy", "--size", 32, "--photos", 6, "--test", 2, "--no-background", "--occluders", .2)
+    assert code == 0 and "8 photos, 2 of them" in out and "reprojection" in out
+    with np.load("data/toy.npz") as s:
+        assert same(dict(s), toy(occluders=.2, background=False))
+    as_colmap(tmp_path / "place", source)
+    code, out, err = run_main("place", "--downscale", 4)
+    assert code == 0 and (tmp_path / "data" / "place.npz").exists() and err == ""
+
+
+@pytest.mark.parametrize("argv", [["toy", "--sizee", "9"], ["toy", "--siz", "9"], ["toy", "--size", "x"], [],
+                                  ["nowhere"], ["brandenburg"], ["nowhere", "--download"], ["place", "--size", "9"],
+                                  ["toy", "--occluders", "2"], ["place", "--downscale", "0"]])
+def test_misspelt_commands_exit_with_2(tmp_path, monkeypatch, argv):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "place").mkdir()
+    code, out, err = run_main(*argv)
+    assert code == 2 and out == "" and "error: " in err and "Traceback" not in err
+
+
+def test_sfm_says_what_to_install_and_calls_pycolmap_in_order(tmp_path, monkeypatch, source):
+    monkeypatch.setitem(sys.modules, "pycolmap", None)
+    assert "pip install pycolmap" in run_main(tmp_path, "--sfm")[2]
+    calls = []
+    fake = types.SimpleNamespace(
+        extract_features=lambda database, photos: calls.append("extract"),
+        match_exhaustive=lambda database: calls.append("match"),
+        incremental_mapping=lambda database, photos, out: {0: types.SimpleNamespace(num_reg_images=lambda: 2),
+                                                           1: types.SimpleNamespace(num_reg_images=lambda: 9)},
+        undistort_images=lambda out, model, photos: (calls.append(model.name), as_colmap(tmp_path, source)))
+    monkeypatch.setitem(sys.modules, "pycolmap", fake)
+    code, out, _ = run_main(tmp_path, "--sfm", "--out", tmp_path / "x.npz")
+    assert code == 0 and calls == ["extract", "match", "1"] and (tmp_path / "x.npz").exists()
+    assert "earlier run" in run_main(tmp_path, "--sfm")[2]   # its photos would be posed twice
+    (tmp_path / "dense").rename(tmp_path / "old")
+    fake.incremental_mapping = lambda *_: {}
+    assert "overlap" in run_main(tmp_path, "--sfm")[2]
+
+
+# ---- geonvs.py -------------------------------------------------------------------------------------
+
+
+TINY = dict(rays=64, photos=4, samples=8, bg_samples=4, hidden=16, levels=2, bg_levels=2, channels=2,
+            appearance_dim=4, mask_px=32, steps=6)
+
+
+def config(**changes):
+    return g.Config(**TINY | changes)
+
+
+def generator(seed=0):
+    return torch.Generator().manual_seed(seed)
+
+
+def random(*shape, seed=0, low=0.0, high=1.0, dtype=torch.float64):
+    return low + (high - low) * torch.rand(*shape, generator=generator(seed), dtype=dtype)
+
+
+def close(a, b, rtol=1e-5, atol=1e-6):
+    a, b = (torch.as_tensor(v).double() for v in (a, b))
+    torch.testing.assert_close(a, b, rtol=rtol, atol=atol)
+
+
+@pytest.fixture(autouse=True)
+def offline(monkeypatch):
+    """Each test starts from the same seed and without a network."""
+    torch.manual_seed(0)
+
+    def unplugged(*args, **kwargs):
+        raise OSError("no network in tests")
+    monkeypatch.setattr(torch.hub, "load_state_dict_from_url", unplugged)
+
+
+@pytest.fixture
+def double(monkeypatch):
+    """Octrees in float64."""
+    monkeypatch.setattr(g, "TRILINEAR", g.TRILINEAR.double())
+
+
+@pytest.fixture
+def brief(monkeypatch):
+    """Models that skip most of the sphere warm-up."""
+    start = g.GeoNVS.start
+    monkeypatch.setattr(g.GeoNVS, "start", lambda self, gen: start(self, gen, 3))
+
+
+@pytest.fixture(scope="session")
+def arrays():
+    return data_prep.make_toy(size=32, photos=8, test=2)
+
+
+@pytest.fixture(scope="session")
+def scene(arrays):
+    return g.load_scene(arrays, "cpu", TINY["mask_px"])
+
+
+@pytest.fixture(scope="session")
+def warm(scene):
+    """A model after its sphere warm-up; a test that changes it takes a copy."""
+    torch.manual_seed(0)
+    gen = generator()
+    model = g.GeoNVS(config(), scene, gen)
+    model.start(gen)
+    model.zero_grad()
+    return model
+
+
+def batch(scene, n=64, photos=4, seed=0):
+    train = torch.nonzero(~scene.is_test)[:, 0]
+    return g.random_rays(scene, train, n, photos, generator(seed))
+
+
+# ---- 2 scene file and rays ---------------------------------------------------------------------------
+
+@pytest.fixture(scope="session")
+def odd():
+    """Two photos, landscape and portrait, with fx != fy and principal points off centre."""
+    rng = np.random.default_rng(0)
+    wh = np.array([[7, 4], [3, 5]])
+    turn = [np.linalg.qr(rng.normal(size=(3, 3)))[0] for _ in wh]
+    turn = np.stack([q * np.sign(np.linalg.det(q)) for q in turn])  # proper rotations
+    start = np.array([0, 28, 43])
+    scene = dict(rgb=rng.integers(0, 256, (43, 3)).astype(np.uint8), start=start, wh=wh,
+                 K=np.array([[6.0, 8, 2.3, 1.1], [4, 3, 2.2, 3.3]]), near=np.array([0.1, 0.2]),
+                 c2w=np.concatenate([turn, rng.normal(size=(2, 3, 1))], 2), is_test=np.array([False, False]),
+                 name=np.array(["a", "b"]), points=np.zeros((0, 3)), center=np.zeros(3), scale=np.array(1.0),
+                 info=np.array(json.dumps(dict(scene="odd", kind="colmap"))))
+    return g.load_scene(scene, "cpu", 8)
+
+
+def pixel_of(scene, photo, x, y):
+    w = int(scene.wh[photo, 0])
+    return scene.raw["rgb"][scene.raw["start"][photo] + y * w + x]
+
+
+def test_ray_through_a_pixel_projects_back_to_its_centre(odd):
+    for i, (w, h) in enumerate(odd.wh.tolist()):
+        rays = g.make_rays(odd, torch.full((w * h,), i), torch.arange(w * h))
+        x = rays.o + random(w * h, 1, low=0.5, high=9, dtype=torch.float32) * rays.d
+        cam = (x - odd.c2w[i, :, 3]) @ odd.c2w[i, :, :3]  # world to camera
+        px = cam[:, :2] / cam[:, 2:] * odd.K[i, :2] + odd.K[i, 2:]
+        want = torch.tensor([[x + 0.5, y + 0.5] for y in range(h) for x in range(w)])
+        close(px, want, atol=1e-4)
+        close(rays.uv * torch.tensor([w, h]), want)
+        assert (cam[:, 2] > 0).all()
+
+
+def test_directions_are_unit_and_origins_are_camera_centres(odd):
+    rays = g.make_rays(odd, torch.tensor([0, 1, 1]), torch.tensor([27, 0, 14]))
+    close(rays.d.norm(dim=1), torch.ones(3))
+    close(rays.o, odd.c2w[[0, 1, 1], :, 3])
+    close(rays.near, [0.1, 0.2, 0.2])
+
+
+def test_principal_point_looks_along_the_camera_axis(odd):
+    d = g.pixel_directions(odd.K[:, 2:], odd.K)
+    close(d, [[0, 0, 1], [0, 0, 1]])
+
+
+def test_rays_carry_the_colour_of_their_pixel(odd):
+    rays = g.make_rays(odd, torch.tensor([0, 1]), torch.tensor([9, 7]))
+    close(rays.rgb * 255, np.stack([pixel_of(odd, 0, 2, 1), pixel_of(odd, 1, 1, 2)]), atol=1e-3)
+
+
+def test_random_rays_come_equally_from_the_photos_allowed_and_cover_them(odd):
+    rays, pick = g.random_rays(odd, torch.tensor([1]), 600, 3, generator())
+    assert pick.tolist() == [1, 1, 1] and set(rays.img.tolist()) == {1}
+    seen = (rays.uv * torch.tensor([3, 5])).floor().unique(dim=0)
+    assert len(seen) == 15  # a pixel is missed with odds 15 (14/15)^600 = 2e-17
+    rays, pick = g.random_rays(odd, torch.tensor([0, 1]), 40, 4, generator(1))
+    assert torch.equal(rays.img, pick.repeat_interleave(10))
+
+
+def test_thumbnails_are_the_photos_in_channel_order(odd):
+    want = [odd.raw["rgb"][a:b].mean(0) for a, b in zip(odd.raw["start"], odd.raw["start"][1:])]
+    close(odd.thumbs.float().mean((2, 3)), np.stack(want), atol=12)
+    assert odd.thumbs.shape == (2, 3, 8, 8)
+
+
+def sphere_rays(o, d, near=0.1):
+    o, d = torch.tensor(o, dtype=torch.float32), F.normalize(torch.tensor(d, dtype=torch.float32), dim=1)
+    n = len(o)
+    return g.Rays(o, d, torch.full((n,), near), torch.zeros(n).long(), torch.zeros(n, 2), torch.zeros(n, 3))
+
+
+SPHERE_CASES = {  # origin, direction, t0, t1, hit; near is 0.1
+    "through the centre": ((0, 0, -3), (0, 0, 1), 2, 4, True),
+    "off centre": ((0.6, 0, -3), (0, 0, 1), 2.2, 3.8, True),
+    "starts inside": ((0, 0, 0), (1, 0, 0), 0.1, 1, True),
+    "leaves it before near": ((0, 0.95, 0), (0, 1, 0), 0.1, 0.1, False),
+    "miss": ((0, 2, -3), (0, 0, 1), 3, 3, False),
+    "miss, closest approach behind": ((0, 2, 3), (0, 0, 1), 0.1, 0.1, False),
+    "behind": ((0, 0, 3), (0, 0, 1), 0.1, 0.1, False),
+    "far away": ((0, 0, -1000), (0, 0, 1), 999, 1001, True),
+}
+
+
+@pytest.mark.parametrize("case", SPHERE_CASES)
+def test_sphere_interval(case):
+    o, d, *want, want_hit = SPHERE_CASES[case]
+    t0, t1, hit = g.sphere_interval(sphere_rays([o], [d]))
+    close([t0.item(), t1.item()], want, atol=1e-3)
+    assert hit.item() is want_hit
+
+
+def test_tangent_ray_has_a_finite_empty_interval():
+    t0, t1, _ = g.sphere_interval(sphere_rays([(0, 1, -3)], [(0, 0, 1)]))
+    close([t0.item(), t1.item()], [3, 3], atol=1e-3)
+
+
+def test_sphere_interval_of_any_ray_is_finite_ordered_and_ends_on_the_sphere():
+    o, d = random(4000, 3, low=-3, high=3).tolist(), random(4000, 3, seed=1, low=-1).tolist()
+    rays = sphere_rays(o, d, near=0.0)
+    t0, t1, hit = g.sphere_interval(rays)
+    assert torch.isfinite(t0 + t1).all() and (t1 >= t0).all() and (t0 >= 0).all()
+    assert (t0 == t1)[~hit].all() and 0.02 < hit.float().mean() < 0.9
+    outside = hit & (rays.o.norm(dim=1) > 1)
+    for t, on in ((t0, outside), (t1, hit)):
+        close((rays.o + t[:, None] * rays.d)[on].norm(dim=1), torch.ones(int(on.sum())), atol=1e-4)
+    closest = -(rays.o * rays.d).sum(1)
+    close(t0[~hit], closest[~hit].clamp(min=0), atol=1e-5)
+
+
+# ---- 3 octree ----------------------------------------------------------------------------------------
+
+def make_tree(seed=0, half=1.3, levels=4, root=3, channels=2, share=0.35, dtype=torch.float64):
+    """A tree with a random share of each level's cells split and random features."""
+    octree = g.Octree(half, levels, channels, root=root).to(dtype)
+    for level in range(levels - 1):
+        ijk = octree.cells[level]
+        octree.split(level, ijk[random(len(ijk), seed=seed + level) < share])
+    fill(octree, seed)
+    return octree
+
+
+def fill(octree, seed=0):
+    octree.features.data[1:] = random(*octree.features[1:].shape, seed=seed, low=-1).to(octree.features)
+
+
+def corners_of(octree):
+    """Level (V-1,) and integer coordinates (V-1,3) of the corners that own a row, from their keys."""
+    key = octree.row_key[1:] % (1 << 40)
+    level = octree.row_key[1:] // (1 << 40) - 1
+    n = torch.tensor([octree.resolution(int(i)) + 1 for i in level])
+    return level, torch.stack([key // n ** 2, key // n % n, key % n], 1)
+
+
+def naive_lookup(octree, x):
+    """Features (L,C) at one point by loops over levels and corners; float64."""
+    level, ijk = corners_of(octree)
+    table = {(a, *b): f for a, b, f in zip(level.tolist(), ijk.tolist(), octree.features[1:].double())}
+    cells = [set(map(tuple, c.tolist())) for c in octree.cells]
+    out = torch.zeros(octree.levels, octree.features.shape[1], dtype=torch.float64)
+    for a in range(octree.levels):
+        at = [(float(v) / (2 * octree.half) + 0.5) * octree.root * 2 ** a for v in x]
+        cell = tuple(math.floor(v) for v in at)
+        if cell not in cells[a]:
+            break
+        for bits in itertools.product((0, 1), repeat=3):
+            weight = math.prod(p - c if b else 1 - (p - c) for p, c, b in zip(at, cell, bits))
+            feature = table.get((a, *(c + b for c, b in zip(cell, bits))))
+            out[a] += 0 if feature is None else weight * feature
+    return out
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_lookup_equals_a_naive_loop(double, seed):
+    octree, x = make_tree(seed), random(150, 3, seed=9, low=-1.3, high=1.3)
+    want = torch.stack([naive_lookup(octree, p) for p in x])
+    close(octree(x)[:, :, 0], want, atol=1e-9)
+    assert (want[:, 3] != 0).any() and (want[:, 3] == 0).any()  # deep and shallow paths both occur
+
+
+def test_lookup_in_float32_is_as_good_as_float32():
+    octree, x = make_tree(dtype=torch.float32), random(100, 3, low=-1.3, high=1.3)
+    close(octree(x.float())[:, :, 0], torch.stack([naive_lookup(octree, p) for p in x]), atol=2e-5)
+
+
+def full_linear_tree(half=1.3):
+    """All cells split; every level's corners hold x + 10 y + 100 z."""
+    octree = g.Octree(half, 3, 1, root=2).double()
+    for level in range(2):
+        octree.split(level, octree.cells[level])
+    level, ijk = corners_of(octree)
+    cell = torch.tensor([octree.cell(int(i)) for i in level])[:, None]
+    octree.features.data[1:, 0] = (ijk * cell.double() - half) @ torch.tensor([1.0, 10, 100]).double()
+    return octree
+
+
+def test_linear_field_with_unequal_slopes_is_reproduced_exactly(double):
+    x = random(300, 3, low=-1.299, high=1.299)
+    want = (x @ torch.tensor([1.0, 10, 100]).double())[:, None].expand(-1, 3)
+    close(full_linear_tree()(x)[:, :, 0, 0], want, atol=1e-9)
+
+
+def test_derivatives_of_a_linear_field_are_its_slopes_per_cell(double):
+    octree, x = full_linear_tree(), random(50, 3, low=-1.2, high=1.2)
+    got = octree(x, derivatives=True)[:, :, 1:, 0]
+    for level in range(3):
+        want = torch.tensor([1.0, 10, 100]).double() * octree.cell(level)
+        close(got[:, level], want.expand(50, 3), atol=1e-9)
+
+
+def test_derivatives_equal_finite_differences(double):
+    octree, x, eps = make_tree(), random(400, 3, low=-1.29, high=1.29), 1e-6
+    finest = (x / 2.6 + 0.5) * octree.resolution(3)
+    x = x[((finest - finest.round()).abs() > 1e-3).all(1)]  # the derivative jumps on faces
+    got = octree(x, derivatives=True)
+    for axis, step in enumerate(torch.eye(3).double() * eps):
+        slope = (octree(x + step) - octree(x - step))[:, :, 0] / (2 * eps)
+        cell = torch.tensor([octree.cell(i) for i in range(4)]).double()[:, None]
+        close(got[:, :, 1 + axis], slope * cell, atol=1e-6)
+    assert torch.equal(got[:, :, :1], octree(x))
+
+
+def test_gradient_reaches_features_through_the_derivatives(double):
+    octree, x = make_tree(levels=2), random(20, 3, low=-1.2, high=1.2)
+    weight = random(20, 2, 4, 2, seed=5)
+    (octree(x, derivatives=True) * weight).sum().backward()
+    v, c = int(octree.corner.max()), 1
+    for row in (1, v // 2, v):
+        before = octree.features.data[row, c].item()
+        ends = []
+        for value in (before - 1e-3, before + 1e-3):
+            octree.features.data[row, c] = value
+            ends.append((octree(x, derivatives=True) * weight).sum().item())
+        octree.features.data[row, c] = before
+        assert octree.features.grad[row, c].item() == pytest.approx((ends[1] - ends[0]) / 2e-3, abs=1e-8)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_field_is_continuous_across_every_face_of_every_cell(double, seed):
+    octree = make_tree(seed, levels=3)
+    for level, cells in enumerate(octree.cells):
+        low = cells.double() * octree.cell(level) - octree.half
+        for axis in range(3):
+            x = low + random(*low.shape, seed=seed) * octree.cell(level)
+            x[:, axis] = low[:, axis]
+            x = x[cells[:, axis] > 0]  # the cube's own faces have one side
+            step = torch.eye(3).double()[axis] * 1e-9
+            close(octree(x - step), octree(x + step), atol=1e-6)
+
+
+def brute_force_corners(octree):
+    """Per level: all corners of its cells, and those with all their cells present."""
+    found = []
+    for level, cells in enumerate(octree.cells):
+        have, n = set(map(tuple, cells.tolist())), octree.resolution(level)
+        around = list(itertools.product((0, 1), repeat=3))
+        corners = {tuple(c + b for c, b in zip(cell, bits)) for cell in have for bits in around}
+        free = set()
+        for k in corners:
+            cells_there = [tuple(c - b for c, b in zip(k, bits)) for bits in around]
+            if all(c in have for c in cells_there if all(0 <= v < n for v in c)):
+                free.add(k)
+        found.append((corners, free))
+    return found
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_each_shared_corner_owns_one_row_and_hanging_corners_none(seed):
+    octree = make_tree(seed)
+    level, ijk = corners_of(octree)
+    for a, (corners, free) in enumerate(brute_force_corners(octree)):
+        owners = list(map(tuple, ijk[level == a].tolist()))
+        assert len(owners) == len(set(owners)) and set(owners) == free
+        assert a == 0 or free < corners  # some do hang in a random tree
+
+
+def test_cells_that_meet_share_rows_and_hanging_corners_point_to_row_zero():
+    octree = make_tree()
+    level, ijk = corners_of(octree)
+    row_of = {(a, *b): i + 1 for i, (a, b) in enumerate(zip(level.tolist(), ijk.tolist()))}
+    node = 8
+    for a, cells in enumerate(octree.cells):
+        for cell in cells.tolist():
+            want = [row_of.get((a, *(c + b for c, b in zip(cell, bits))), 0)
+                    for bits in itertools.product((0, 1), repeat=3)]
+            assert octree.corner[node].tolist() == want
+            node += 1
+    assert node == len(octree.corner) == len(octree.child)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_split_does_not_change_the_function_by_a_bit(double, seed):
+    octree, x = make_tree(seed, share=0.2), random(500, 3, low=-1.3, high=1.3)
+    before = octree(x, derivatives=True)
+    for level in (0, 1, 2, 0):
+        ijk, n = octree.cells[level], sum(map(len, octree.cells))
+        octree.split(level, ijk[random(len(ijk), seed=n) < 0.5])
+        assert sum(map(len, octree.cells)) > n
+        assert torch.equal(octree(x, derivatives=True), before)
+
+
+def structure(octree):
+    return [octree.row_key, octree.child, octree.corner, *octree.cells, *octree.split_keys]
+
+
+def same_structure(a, b):
+    return len(a) == len(b) and all(torch.equal(x, y) for x, y in zip(a, b))
+
+
+def test_splitting_twice_is_splitting_once():
+    octree = make_tree(levels=3)
+    ijk = octree.cells[1][::3]
+    octree.split(1, ijk)
+    fill(octree)
+    once, features = structure(octree), octree.features.clone()
+    octree.split(1, ijk)
+    assert same_structure(structure(octree), once) and torch.equal(octree.features, features)
+
+
+def test_prune_then_split_restores_structure_and_zeroes_only_what_was_cut():
+    octree = make_tree(levels=3, share=0.6)
+    ijk = octree.cells[0][::4]
+    octree.split(0, ijk)
+    fill(octree)
+    before, features, keys = structure(octree), octree.features.clone(), octree.split_keys[1]
+    octree.prune(0, ijk)
+    assert len(octree.row_key) < len(before[0])
+    surviving = torch.isin(before[0], octree.row_key)
+    octree.split(0, ijk)
+    octree.build([octree.split_keys[0], keys])
+    assert same_structure(structure(octree), before)
+    assert torch.equal(octree.features[surviving], features[surviving])
+    assert (octree.features[~surviving] == 0).all()
+
+
+def test_prune_removes_whole_subtrees():
+    octree = make_tree(share=0.7)
+    octree.prune(0, octree.cells[0])
+    assert [len(c) for c in octree.cells] == [27, 0, 0, 0]
+
+
+def test_splitting_a_cell_that_does_not_exist_changes_nothing():
+    octree = make_tree(levels=3, share=0.3)
+    leaf = octree.cells[0][~torch.isin(octree.key(octree.cells[0], 0), octree.split_keys[0])]
+    before = structure(octree)
+    octree.split(1, 2 * leaf)  # children of leaves
+    assert same_structure(structure(octree), before)
+
+
+def test_old_row_maps_rows_by_the_corner_they_stand_for():
+    octree = make_tree(levels=3)
+    keys, features = octree.row_key, octree.features.detach().clone()
+    for change in (lambda: octree.split(1, octree.cells[1][::5]), lambda: octree.prune(0, octree.cells[0][:9])):
+        old_row = change()
+        assert torch.equal(octree.features, features[old_row])
+        kept = old_row > 0
+        assert torch.equal(octree.row_key[kept], keys[old_row[kept]])
+        assert not torch.isin(octree.row_key[~kept][1:], keys).any()
+        keys, features = octree.row_key, octree.features.detach().clone()
+
+
+def test_the_pinned_row_is_zero_and_gets_no_gradient():
+    octree = make_tree(dtype=torch.float32)
+    octree(random(200, 3, low=-1.3, high=1.3, dtype=torch.float32), True).square().sum().backward()
+    assert (octree.features[0] == 0).all() and (octree.features.grad[0] == 0).all()
+    assert (octree.features.grad[1:] != 0).any()
+
+
+def test_interpolate_passes_gradcheck():
+    features = random(12, 2, low=-1).requires_grad_()
+    corner = 1 + (random(5, 8, seed=1) * 11).long()
+    w = random(5, 3, 8, seed=2, low=-1)
+    assert torch.autograd.gradcheck(lambda f: g.Interpolate.apply(f, corner, w), (features,))
+
+
+def test_interpolate_equals_a_naive_sum_also_when_corners_repeat():
+    features, w = random(4, 2, low=-1), random(3, 2, 8, seed=2, low=-1)
+    corner = torch.tensor([[0, 1, 1, 1, 2, 3, 3, 0], [1] * 8, [0] * 8])
+    close(g.Interpolate.apply(features, corner, w), torch.einsum("pjk,pkc->pjc", w, features[corner]))
+
+
+def test_memory_of_a_shell_grows_fourfold_per_level_not_eightfold():
+    octree = g.Octree(1.0, 4, 1)
+    sizes = [octree.bytes()]
+    for level in range(3):
+        r = ((octree.cells[level] + 0.5) * octree.cell(level) - 1).norm(dim=1)
+        octree.split(level, octree.cells[level][(r - 0.5).abs() < octree.cell(level)])
+        sizes.append(octree.bytes())
+    growth = [(sizes[3] - sizes[2]) / (sizes[2] - sizes[1])]
+    assert 3.5 < growth[0] < 4.5
+
+
+@pytest.mark.parametrize("far", [1.0, 1.5, 100.0, 1e30])
+def test_points_outside_the_cube_get_the_nearest_features_inside(far):
+    octree = make_tree(half=1.0, dtype=torch.float32)
+    x = random(100, 3, low=-1, dtype=torch.float32)
+    x[:, 1] = far
+    edge = x.clone()
+    edge[:, 1] = 1.0
+    assert torch.equal(octree(x), octree(edge)) and torch.isfinite(octree(-x)).all()
+
+
+def test_trilinear_weights_sum_to_one_and_their_derivatives_to_zero():
+    f = random(20, 3)
+    basis = torch.stack([f[:, 0] ** i * f[:, 1] ** j * f[:, 2] ** k
+                         for i, j, k in itertools.product((0, 1), repeat=3)], 1)
+    w = (basis @ g.TRILINEAR.double()).reshape(20, 4, 8)
+    close(w.sum(2), torch.tensor([1.0, 0, 0, 0]).expand(20, 4))
+
+
+def test_seeding_refines_around_points_with_no_hanging_corner_beside_them():
+    octree, points = g.Octree(1.0, 4, 1, root=8), random(6, 3, low=-0.5, high=0.5, dtype=torch.float32)
+    g.seed_octree(octree, points, 1, (0.0, 1.0))
+    corner, _ = octree.locate(points)
+    assert (corner > 0).all() and len(octree.cells[3]) <= 8 * 27 * 6
+    assert (octree.features[1:] != 0).all() and (octree.features[0] == 0).all()
+
+
+def test_seeding_a_shell_splits_exactly_what_may_touch_it():
+    octree = g.Octree(2.0, 2, 1, root=8)
+    g.seed_octree(octree, torch.zeros(0, 3), 1, (1.0, 2.0))
+    x = random(3000, 3, low=-2, high=2, dtype=torch.float32)
+    r, split = x.norm(dim=1), torch.isin(octree.key(octree.cell_of(x, 0), 0), octree.split_keys[0])
+    diagonal = 0.5 * math.sqrt(3)
+    assert split[(r > 1) & (r < 2)].all() and not split[(r < 1 - diagonal) | (r > 2 + diagonal)].any()
+
+
+def test_around_is_the_neighbourhood_each_cell_once_nearest_first():
+    octree = g.Octree(1.0, 2, 1, root=4)
+    cells = torch.tensor([[0, 5, 7], [1, 5, 7], [4, 0, 3]])
+    got = list(map(tuple, octree.around(cells, 1).tolist()))
+    want = [tuple(min(max(c + b, 0), 7) for c, b in zip(cell, bits))
+            for cell in cells.tolist() for bits in itertools.product((-1, 0, 1), repeat=3)]
+    assert got == list(dict.fromkeys(want))
+
+
+@pytest.mark.parametrize("footprint", [0.02, 0.011, 0.004])
+def test_the_finest_cell_is_one_to_two_pixels_at_the_surface(footprint):
+    cell = 2 / (16 << (g.levels_for_footprint(footprint) - 1))
+    assert footprint <= cell < 2 * footprint
+    assert g.levels_for_footprint(footprint / 2) == g.levels_for_footprint(footprint) + 1  # twice the focal length
+
+
+def test_levels_stay_between_two_and_eight():
+    assert g.levels_for_footprint(5.0) == 2 and g.levels_for_footprint(1e-9) == 8
+
+
+# ---- 4 fields ----------------------------------------------------------------------------------------
+
+def make_field(dtype=torch.float64, seed=0):
+    torch.manual_seed(seed)
+    field = g.SDFField(make_tree(seed, half=1.0, levels=3, dtype=dtype), 16).to(dtype)
+    return field
+
+
+def test_with_gradient_returns_forward_and_its_central_differences(double):
+    field, x, eps = make_field(), random(300, 3, low=-0.99, high=0.99), 1e-6
+    fine = (x / 2 + 0.5) * field.octree.resolution(2)
+    x = x[((fine - fine.round()).abs() > 1e-3).all(1)]
+    sdf, geo, grad = field.with_gradient(x)
+    assert torch.equal(sdf, field(x)[0]) and torch.equal(geo, field(x)[1])
+    want = torch.stack([(field(x + e)[0] - field(x - e)[0]) / (2 * eps) for e in torch.eye(3).double() * eps], 1)
+    close(grad, want, rtol=1e-5, atol=1e-5)
+
+
+def test_with_gradient_in_float32_agrees_with_float64(double):
+    field, x = make_field(), random(100, 3, low=-0.9, high=0.9).float().double()
+    want = field.with_gradient(x)[2]
+    g.TRILINEAR = g.TRILINEAR.float()
+    got = copy.deepcopy(field).float().with_gradient(x.float())[2]
+    close(got, want, rtol=1e-3, atol=1e-3)
+
+
+def test_training_through_normals_reaches_every_weight_of_the_field(double):
+    field = make_field()
+    field.with_gradient(random(50, 3, low=-0.9, high=0.9))[2].square().sum().backward()
+    got = {name: p.grad is not None and bool((p.grad != 0).any()) for name, p in field.named_parameters()}
+    assert [k for k, v in got.items() if not v] == ["lin2.bias"]  # the one shift that no derivative sees
+
+
+def quadratic(seed, diagonal=False):
+    A = random(3, 3, seed=seed, low=-1)
+    A = torch.diag(A.diagonal()) if diagonal else A + A.T
+    b = random(3, seed=seed + 1, low=-1)
+    return A, b, lambda x: ((x @ A) * x).sum(1) + x @ b + 0.7
+
+
+@pytest.mark.parametrize("eps", [1e-3, 0.1, 1.0])
+def test_laplacian_is_exact_for_quadratics_of_any_step(monkeypatch, eps):
+    monkeypatch.setattr(g, "TETRAHEDRON", g.TETRAHEDRON.double())
+    A, _, f = quadratic(0)
+    x = random(20, 3, low=-1)
+    close(g.finite_differences(f, x, eps)[1], torch.full((20,), 2 * A.trace().item()), rtol=1e-6, atol=1e-7)
+
+
+@pytest.mark.parametrize("eps", [1e-3, 0.1, 1.0])
+def test_gradient_is_exact_for_quadratics_up_to_the_mixed_terms_of_a_tetrahedron(monkeypatch, eps):
+    """A tetrahedron has no point symmetry: 2 A_yz y z leaks eps 2/sqrt(3) A_yz into the x slope, and so on."""
+    monkeypatch.setattr(g, "TETRAHEDRON", g.TETRAHEDRON.double())
+    x = random(20, 3, low=-1)
+    A, b, f = quadratic(3, diagonal=True)
+    close(g.finite_differences(f, x, eps)[0], 2 * x @ A + b, atol=1e-9)
+    A, b, f = quadratic(3)
+    leak = eps * 2 / math.sqrt(3) * torch.stack([A[1, 2], A[0, 2], A[0, 1]])
+    close(g.finite_differences(f, x, eps)[0], 2 * x @ A + b + leak, atol=1e-9)
+
+
+def test_gradient_error_shrinks_with_eps_and_laplacian_error_too(monkeypatch):
+    monkeypatch.setattr(g, "TETRAHEDRON", g.TETRAHEDRON.double())
+    x = random(30, 3, low=0.3, high=0.9)
+    error = []
+    for eps in (0.04, 0.02, 0.01):  # |x| has gradient x / |x| and Laplacian 2 / |x|
+        grad, lap = g.finite_differences(lambda y: y.norm(dim=1), x, eps)
+        error.append([(grad - F.normalize(x, dim=1)).norm(), (lap - 2 / x.norm(dim=1)).abs().mean()])
+    ratio = torch.tensor(error)[:-1] / torch.tensor(error)[1:]
+    assert (ratio > 1.8).all()
+
+
+def test_taps_are_unit_steps_and_a_given_centre_saves_its_evaluation():
+    calls = []
+
+    def f(y):
+        calls.append(y)
+        return y[:, 0] * 3
+    x = random(5, 3, dtype=torch.float32)
+    g.finite_differences(f, x, 0.5, x[:, 0] * 3)
+    assert [len(c) for c in calls] == [20]
+    close((calls[0].reshape(5, 4, 3) - x[:, None]).norm(dim=2), torch.full((5, 4), 0.5))
+
+
+def test_spherical_harmonics_are_orthogonal_on_the_sphere():
+    z, wz = np.polynomial.legendre.leggauss(8)
+    phi = np.arange(16) * 2 * np.pi / 16
+    z, phi, w = np.repeat(z, 16), np.tile(phi, 8), np.repeat(wz, 16) / 16
+    rho = np.sqrt(1 - z ** 2)
+    basis = g.sh_basis(torch.as_tensor(np.stack([rho * np.cos(phi), rho * np.sin(phi), z], 1)))
+    gram = (basis * torch.as_tensor(w)[:, None]).T @ basis
+    assert basis.shape == (128, 9) and (gram.diagonal() > 0.05).all()
+    close(gram - torch.diag(gram.diagonal()), torch.zeros(9, 9), atol=1e-12)
+
+
+def test_spherical_harmonics_of_a_turn_around_z_change_only_where_they_must():
+    angle = torch.linspace(0, 6, 20)
+    basis = g.sh_basis(torch.stack([0.6 * angle.cos(), 0.6 * angle.sin(), torch.full((20,), 0.8)], 1))
+    assert (basis.std(0) < 1e-6).nonzero()[:, 0].tolist() == [0, 3, 8]
+    close(basis[0, [0, 3, 8]], [1, 0.8, 3 * 0.64 - 1])
+
+
+def lipschitz(tight):
+    torch.manual_seed(0)
+    mlp = g.LipschitzMLP([6, 20, 20, 3])
+    with torch.no_grad():
+        mlp.c -= tight
+    return mlp
+
+
+@pytest.mark.parametrize("tight", [0, 1, 3])
+def test_lipschitz_bound_holds_for_random_pairs(tight):
+    mlp = lipschitz(tight)
+    a, b = random(2, 4000, 6, low=-3, high=3, dtype=torch.float32)
+    rise = (mlp(a) - mlp(b)).abs().amax(1) / (a - b).abs().amax(1)
+    assert rise.max() <= mlp.bounds().prod() * 1.0001
+
+
+def test_lipschitz_bound_is_reached_by_a_single_clamped_layer():
+    mlp = g.LipschitzMLP([4, 1])
+    with torch.no_grad():
+        mlp.c.fill_(math.log(math.expm1(0.1)))
+    step = mlp.layers[0].weight.sign()
+    assert (mlp(step) - mlp(-step)).item() / 2 == pytest.approx(0.1, rel=1e-4)
+
+
+def test_lipschitz_mlp_starts_as_a_plain_mlp_with_twice_the_room():
+    mlp, x = lipschitz(0), random(30, 6, dtype=torch.float32)
+    y = x
+    for i, layer in enumerate(mlp.layers):
+        y = layer(y if i == 0 else F.relu(y))
+    close(mlp(x), y)
+    close(mlp.bounds().detach(), [2 * la.weight.detach().abs().sum(1).max().item() for la in mlp.layers], rtol=1e-4)
+
+
+def test_contract_is_identity_inside_below_two_outside_continuous_and_monotone():
+    d = F.normalize(random(50, 1, 3, low=-1), dim=2)
+    r = torch.tensor([0.0, 0.3, 0.999999, 1.0, 1.000001, 2, 10, 1e6])[:, None].double()  # (8,1)
+    y = g.contract(d * r)
+    n = y.norm(dim=2)  # (50,8)
+    close(y[:, :4], (d * r)[:, :4])
+    close(n[:, 4:], (2 - 1 / r[4:, 0]).expand(50, 4))
+    assert (n < 2).all() and (n.diff(dim=1) > 0).all() and (n[:, 4] - n[:, 2] < 1e-5).all()
+    close(F.cosine_similarity(y[:, 1:], d.expand(50, 7, 3), dim=2), torch.ones(50, 7))
+
+
+class Recorder(nn.Module):
+    """Stands in for an octree: remembers the points asked for; features are functions of position."""
+
+    def __init__(self, channels=2):
+        super().__init__()
+        self.levels, self.features, self.seen = 1, torch.zeros(1, channels), []
+
+    def forward(self, x, derivatives=False):
+        self.seen.append(x)
+        return torch.stack([x.sum(1), x[:, 0]], 1)[:, None, None]
+
+
+def make_background(appearance=3):
+    torch.manual_seed(0)
+    return g.Background(Recorder(), 16, appearance)
+
+
+def test_background_of_one_colour_shows_exactly_that_colour():
+    bg, rays = make_background(), sphere_rays([(0, 0, -3), (0, 3, 0)], [(0, 0, 1), (1, 0, 0)])
+    with torch.no_grad():
+        bg.color[2].weight.zero_()
+        bg.color[2].bias.copy_(torch.tensor([-1.0, 0, 2]))
+        got = bg(rays, torch.tensor([4.0, 1]), torch.zeros(2, 3), 5, torch.rand(2, 5))
+    close(got, torch.sigmoid(torch.tensor([-1.0, 0, 2])).expand(2, 3), atol=2e-6)
+
+
+def test_background_samples_start_at_the_sphere_exit_and_stay_outside():
+    bg, rays = make_background(), sphere_rays([(0.3, 0.2, -3)] * 2, [(0, 0.1, 1), (0, 0, 1)])
+    _, t1, _ = g.sphere_interval(rays)
+    bg(rays, t1, torch.zeros(2, 3), 6, torch.zeros(2, 6))
+    x = bg.octree.seen[0].reshape(2, 6, 3)
+    close(x[:, 0], rays.o + t1[:, None] * rays.d, atol=1e-5)
+    r = x.norm(dim=2)
+    assert (r.diff(dim=1) > 0).all() and (r < 2).all() and (r[:, 0] > 1 - 1e-5).all()
+
+
+def test_background_equals_a_naive_loop_over_its_sections():
+    bg, n = make_background(), 4
+    rays = sphere_rays([(0.3, 0.2, -3), (0, 2, 0)], [(0, 0.1, 1), (1, 0, 0.3)])
+    start, jitter = torch.tensor([3.0, 0.5]), random(2, n, seed=4, dtype=torch.float32)
+    code = random(2, 3, seed=5, dtype=torch.float32)
+    want = []
+    with torch.no_grad():
+        for i in range(2):
+            u = [(j + jitter[i, j].item()) / n for j in range(n)]
+            t = [start[i].item() + v / (1 - v) for v in u]
+            rgb, left = torch.zeros(3), 1.0
+            for j in range(n):
+                x = rays.o[i] + t[j] * rays.d[i]
+                x = (g.contract(x))[None]
+                out = bg.density(torch.cat([x, bg.octree(x).flatten(1)], 1))[0]
+                sigma = math.log1p(math.exp(out[0].item() - 1))
+                opacity = 1 - math.exp(-sigma * (t[j + 1] - t[j])) if j + 1 < n else 1.0
+                look = torch.cat([out[1:], g.sh_basis(rays.d[i:i + 1])[0], code[i]])
+                rgb += left * opacity * torch.sigmoid(bg.color(look))
+                left *= 1 - opacity
+            want.append(rgb)
+        close(bg(rays, start, code, n, jitter), torch.stack(want), atol=1e-5)
+
+
+def test_background_is_finite_at_the_largest_jitter():
+    bg, rays = make_background(), sphere_rays([(0, 0, -3)], [(0, 0, 1)])
+    assert torch.isfinite(bg(rays, torch.tensor([4.0]), torch.zeros(1, 3), 3, torch.ones(1, 3))).all()
+
+
+# ---- 5 alpha, compositing, sampling -------------------------------------------------------------------
+
+def sigmoid(x):
+    return 1 / (1 + math.exp(-x))
+
+
+def test_deviation_starts_at_its_width_and_is_an_exponential_within_bounds():
+    deviation = g.Deviation(20.0)
+    assert deviation().item() == pytest.approx(20, rel=1e-4)
+    deviation.v.data += 0.1
+    assert deviation().item() == pytest.approx(20 * math.e, rel=1e-4)
+    for v, want in ((-50.0, 1e-2), (50.0, 1e5)):
+        deviation.v.data.fill_(v)
+        assert deviation().item() == pytest.approx(want)
+
+
+@pytest.mark.parametrize("zeta, s, cos, dt", [(20, 0.05, -0.7, 0.1), (3, -0.2, -1, 0.5), (200, 0.01, -0.2, 0.03),
+                                              (50, 0.0, -0.5, 0.2), (1, 2.0, -0.9, 3.0)])
+def test_alpha_equals_the_two_sided_formula(zeta, s, cos, dt):
+    before, after = s - cos * dt / 2, s + cos * dt / 2
+    want = 1 - sigmoid(zeta * after) / sigmoid(zeta * before)
+    got = g.neus_alpha(*(torch.tensor([[v]], dtype=torch.float64) for v in (s, cos, dt)), torch.tensor(float(zeta)).double())
+    assert got.item() == pytest.approx(want, rel=1e-9, abs=1e-12)
+
+
+def ray_of_plane(cos, n, zeta, start=1.0, length=2.0, offset=0.1, dtype=torch.float64):
+    """Sections of a ray that crosses the plane at s = 0 with slope cos: (sdf, cos, dt, zeta), edge values."""
+    edges = torch.linspace(0, length, n + 1, dtype=dtype)
+    f = offset - cos * start + cos * edges
+    t = (edges[1:] + edges[:-1]) / 2
+    mid = (offset - cos * start + cos * t)[None]
+    return (mid, torch.full_like(mid, cos), edges.diff()[None], torch.tensor(zeta, dtype=dtype)), f
+
+
+@pytest.mark.parametrize("cos", [-1.0, -0.6, -0.05])
+def test_alpha_of_a_plane_is_neus_equation_13(cos):
+    args, f = ray_of_plane(cos, 40, 15.0)
+    phi = torch.sigmoid(15.0 * f)
+    close(g.neus_alpha(*args)[0], ((phi[:-1] - phi[1:]) / phi[:-1]).clamp(min=0), atol=1e-12)
+
+
+def test_slope_form_converges_to_the_two_sample_form_on_a_curved_surface():
+    gap = []
+    for n in (16, 64, 256):
+        edges = torch.linspace(0, 2, n + 1).double()
+        t = (edges[1:] + edges[:-1]) / 2
+
+        def ball(t):  # ray passing a sphere of radius 0.6 at distance 0.3
+            return torch.sqrt((t - 1) ** 2 + 0.09) - 0.6
+        slope = (t - 1) / torch.sqrt((t - 1) ** 2 + 0.09)
+        got = g.neus_alpha(ball(t)[None], slope[None], edges.diff()[None], torch.tensor(20.0).double())[0]
+        phi = torch.sigmoid(20 * ball(edges))
+        gap.append((got - ((phi[:-1] - phi[1:]) / phi[:-1]).clamp(min=0)).abs().max())
+    assert gap[0] > 8 * gap[1] > 64 * gap[2]
+
+
+@pytest.mark.parametrize("n", [3, 50, 1000])
+def test_transmittance_through_a_wall_telescopes(n):
+    args, f = ray_of_plane(-0.7, n, 6.0)
+    _, trans = g.composite(g.neus_alpha(*args))
+    want = sigmoid(6 * f[-1].item()) / sigmoid(6 * f[0].item())
+    assert trans.item() == pytest.approx(want, rel=1e-9)
+
+
+def test_printed_alpha_sums_to_one_but_leaves_a_wall_63_percent_opaque():
+    args, _ = ray_of_plane(-1.0, 4000, 40.0)
+    printed = g.printed_alpha(*args)
+    assert printed.sum().item() == pytest.approx(1, abs=2e-3)
+    assert g.composite(printed)[0].sum().item() == pytest.approx(1 - 1 / math.e, abs=2e-3)
+    assert g.composite(g.neus_alpha(*args))[0].sum().item() == pytest.approx(1, abs=1e-6)
+
+
+def test_printed_alpha_is_equation_1_literally():
+    s, cos, dt = torch.tensor([[0.3, 0.1, -0.2]]), torch.tensor([[-1.0, -0.5, -0.8]]), torch.tensor([[0.2, 0.3, 0.1]])
+    got = g.printed_alpha(s, cos, dt, torch.tensor(9.0))[0].tolist()
+    for i in range(2):
+        beta = cos[0, i].item() * dt[0, i].item() / 2
+        want = sigmoid(9 * s[0, i].item() + beta) - sigmoid(9 * s[0, i + 1].item() + beta)
+        assert got[i] == pytest.approx(want, abs=1e-6)
+    assert got[2] == 0
+
+
+def test_printed_alpha_goes_negative_where_a_ray_leaves_and_neus_alpha_is_transparent():
+    args, _ = ray_of_plane(0.8, 30, 20.0)
+    assert (g.printed_alpha(*args)[0, :-1] < 0).all()
+    assert (g.neus_alpha(*args) == 0).all()
+
+
+GRID = torch.cartesian_prod(*(torch.tensor(v) for v in (
+    [1e-2, 1.0, 30.0, 1e3, 1e6], [-1e4, -10.0, -0.1, -1e-4, 0.0, 1e-4, 0.1, 10.0, 1e4],
+    [-1.0, -1e-3, 0.0, 0.5, 100.0, -100.0], [0.0, 1e-5, 0.1, 1e3])))
+
+
+def test_alpha_and_its_gradients_are_finite_for_all_magnitudes():
+    zeta, s, cos, dt = (c.clone().requires_grad_() for c in GRID.T)
+    alpha = g.neus_alpha(s, cos, dt, zeta)
+    grads = torch.autograd.grad(alpha.sum(), (s, cos, dt, zeta))
+    assert len(alpha) == 1080 and ((alpha >= 0) & (alpha <= 1)).all()
+    assert all(torch.isfinite(v).all() for v in grads)
+
+
+@pytest.mark.parametrize("k", [1e-2, 0.5, 7.0])
+def test_alpha_does_not_change_when_space_is_scaled_and_zeta_with_it(k):
+    s, cos, dt = random(9, 9, low=-0.3, high=0.3), random(9, 9, seed=1, low=-1), random(9, 9, seed=2)
+    zeta = torch.tensor(15.0).double()
+    close(g.neus_alpha(k * s, cos, k * dt, zeta / k), g.neus_alpha(s, cos, dt, zeta), rtol=1e-9)
+
+
+def test_alpha_grows_with_the_section_and_with_the_slope():
+    s, zeta = torch.tensor([[0.02] * 20]), torch.tensor(30.0)
+    rising = torch.linspace(0.01, 1, 20)[None]
+    assert (g.neus_alpha(s, torch.full_like(s, -0.5), rising, zeta).diff() > 0).all()
+    assert (g.neus_alpha(s, -rising, torch.full_like(s, 0.1), zeta).diff() > 0).all()
+
+
+def test_composite_equals_a_naive_loop():
+    alpha = random(6, 9)
+    w, trans = g.composite(alpha)
+    for i in range(6):
+        left = 1.0
+        for j in range(9):
+            assert w[i, j].item() == pytest.approx(left * alpha[i, j].item(), abs=1e-12)
+            left *= 1 - alpha[i, j].item()
+        assert trans[i].item() == pytest.approx(left, abs=1e-12)
+
+
+@pytest.mark.parametrize("alpha", [[0.0, 0, 0], [1.0, 1, 1], [0.3, 0.9, 0.1], [1.0, 0.5, 0], [0.0, 0, 1]])
+def test_weights_and_what_passes_sum_to_one_with_finite_gradients(alpha):
+    alpha = torch.tensor([alpha]).requires_grad_()
+    w, trans = g.composite(alpha)
+    assert (w.sum() + trans).item() == pytest.approx(1, abs=3e-6)
+    grad, = torch.autograd.grad((w * torch.tensor([1.0, 2, 3])).sum() + 5 * trans.sum(), alpha)
+    assert torch.isfinite(grad).all()
+
+
+def test_an_opaque_section_hides_all_behind_it():
+    w, trans = g.composite(torch.tensor([[1.0, 0.7, 0.9]]))
+    close(w, [[1, 0, 0]], atol=2e-6)
+    assert trans.item() < 2e-6
+
+
+def test_gradient_of_composite_equals_that_of_the_plain_product():
+    alpha = random(1, 7, low=0.1, high=0.9).requires_grad_()
+    color = random(7, seed=3)
+    before = torch.cat([torch.ones(1).double(), torch.cumprod(1 - alpha[0], 0)[:-1]])
+    want, = torch.autograd.grad((before * alpha[0] * color).sum(), alpha)
+    got, = torch.autograd.grad((g.composite(alpha)[0] * color).sum(), alpha)
+    close(got, want, rtol=1e-9)
+
+
+def test_inverse_cdf_of_uniform_weights_is_the_straight_line():
+    edges, u = torch.linspace(2, 6, 9)[None].double(), random(1, 50).sort().values
+    close(g.inverse_cdf(edges, torch.ones(1, 8).double(), u), 2 + 4 * u, rtol=1e-9)
+
+
+def test_inverse_cdf_of_one_heavy_section_stays_inside_it():
+    weight = torch.zeros(1, 8).double()
+    weight[0, 5] = 3
+    got = g.inverse_cdf(torch.linspace(0, 8, 9)[None].double(), weight, random(1, 50))
+    assert ((got >= 5) & (got <= 6)).all()
+    close(got, 5 + random(1, 50), atol=1e-9)
+
+
+def test_inverse_cdf_inverts_the_cdf_and_shares_samples_by_weight():
+    edges, weight = random(3, 9, seed=1).cumsum(1), random(3, 8, seed=2)
+    u = ((torch.arange(8000) + 0.5) / 8000).double().expand(3, -1)
+    t = g.inverse_cdf(edges, weight, u)
+    assert (t.diff(dim=1) >= 0).all()
+    for i in range(3):
+        share = np.histogram(t[i], edges[i])[0] / 8000
+        close(share, weight[i] / weight[i].sum(), atol=2 / 8000, rtol=0)
+
+
+def test_inverse_cdf_at_zero_and_one_returns_the_ends():
+    got = g.inverse_cdf(torch.tensor([[1.0, 2, 4]]), torch.tensor([[0.2, 0.8]]), torch.tensor([[0.0, 1.0]]))
+    close(got, [[1, 4]])
+
+
+CENTRE, BALL_R = torch.tensor([0.1, -0.25, 0.3]), 0.4  # off centre and unequal, so that swapped axes show
+
+
+class Ball:
+    """A signed distance to a ball, times `slope`, with the interface of SDFField."""
+
+    def __init__(self, slope=1.0):
+        self.slope, self.seen = slope, []
+
+    def __call__(self, x):
+        self.seen.append(x)
+        return self.slope * ((x - CENTRE).norm(dim=1) - BALL_R), x.new_zeros(len(x), g.GEO)
+
+    def with_gradient(self, x):
+        return *self(x), self.slope * F.normalize(x - CENTRE, dim=1)
+
+
+def ball_model(zeta=400.0, slope=1.0, **changes):
+    line = torch.linspace(-1, 1, 64)
+    cache = Ball()(torch.cartesian_prod(line, line, line))[0].reshape(1, 1, 64, 64, 64)
+    return SimpleNamespace(cfg=config(**dict(samples=48) | changes), sdf=Ball(slope), deviation=lambda: torch.tensor(zeta),
+                           color=lambda z: torch.zeros(len(z), 3), background=None, cache=cache, eps=0.01,
+                           bg_color=torch.tensor([0.9, 0.1, 0.3]))
+
+
+def ball_rays(n=40, seed=0):
+    """Rays from outside the unit sphere at points near the ball, and the true distance to it (inf: misses)."""
+    o = 3 * F.normalize(random(n, 3, seed=seed, low=-1, dtype=torch.float32), dim=1)
+    target = CENTRE + random(n, 3, seed=seed + 1, low=-0.5, high=0.5, dtype=torch.float32)
+    rays = sphere_rays(o.tolist(), (target - o).tolist())
+    m = rays.o - CENTRE
+    b = (m * rays.d).sum(1)
+    disc = b ** 2 - (m * m).sum(1) + BALL_R ** 2
+    return rays, torch.where(disc > 0, -b - disc.clamp(min=0).sqrt(), math.inf), disc
+
+
+def test_weights_from_the_cache_of_a_plane_are_those_of_the_plane():
+    """Trilinear lookups reproduce a linear field; a voxel's shift or swapped axes would show."""
+    line, slopes = torch.linspace(-1, 1, 33), torch.tensor([0.3, -0.5, 0.8])
+    cache = (torch.cartesian_prod(line, line, line) @ slopes - 0.1).reshape(1, 1, 33, 33, 33)
+    rays = sphere_rays([(0.1, 0.2, -3)] * 3, [(0, 0.05, 1), (0.1, 0, 1), (-0.1, 0.1, 1)])
+    rays = rays._replace(d=-rays.d, o=-rays.o)  # looking inwards
+    edges = torch.linspace(2.2, 3.6, 41).expand(3, -1)
+    s = (rays.o[:, None] + edges[:, :, None] * rays.d[:, None]) @ slopes - 0.1
+    phi = torch.sigmoid(30.0 * s.double())
+    want, _ = g.composite((1 - phi[:, 1:] / phi[:, :-1]).clamp(min=0))
+    got = g.cached_weight(cache, rays, edges, 30.0)
+    close(got, want, atol=1e-4)
+    assert got.max() > 0.05
+
+
+@pytest.mark.parametrize("sampling", ["cached", "uniform"])
+def test_sections_are_sorted_and_tile_the_ray(sampling):
+    rays, *_ = ball_rays()
+    t0, t1, _ = g.sphere_interval(rays)
+    edges = g.sample_sections(ball_model(sampling=sampling), rays, t0, t1, 16, torch.rand(40, 16))
+    assert edges.shape == (40, 17) and (edges.diff(dim=1) >= -1e-6).all()
+    assert torch.equal(edges[:, 0], t0) and torch.equal(edges[:, -1], t1)
+
+
+def test_uniform_sampling_is_stratified():
+    rays, *_ = ball_rays()
+    t0, t1, _ = g.sphere_interval(rays)
+    edges = g.sample_sections(ball_model(sampling="uniform"), rays, t0, t1, 9, torch.rand(40, 9))
+    stratum = ((edges[:, 1:-1] - t0[:, None]) / (t1 - t0)[:, None] * 8).clamp(0, 7.999).floor()
+    close(stratum, torch.arange(8).expand(40, 8))
+
+
+def test_cached_samples_gather_where_the_cache_sees_the_surface():
+    rays, depth, disc = ball_rays(80)
+    t0, t1, _ = g.sphere_interval(rays)
+    hits = disc > 0.02
+    edges = g.sample_sections(ball_model(), rays, t0, t1, 32, torch.full((80, 32), 0.5))[hits, 1:-1]
+    near = ((edges - depth[hits, None]).abs() < 0.15).float().mean(1)
+    assert hits.sum() > 20 and near.min() > 0.6  # uniform samples: less than 0.2
+    assert (~(near == 1)).any()  # and the floor keeps looking elsewhere
+
+
+def test_jitter_moves_edges_within_their_stratum_and_in_its_direction():
+    (rays, *_), model = ball_rays(), ball_model(sampling="uniform")
+    t0, t1, _ = g.sphere_interval(rays)
+    low, mid, high = (g.sample_sections(model, rays, t0, t1, 9, torch.full((40, 9), v))[:, 1:-1] for v in (0.0, 0.5, 1.0))
+    close(mid, (low + high) / 2, atol=1e-5)
+    close(low[:, 1:], high[:, :-1], atol=1e-5)
+    assert (high > low).all()
+
+
+def test_cached_samples_spread_over_a_voxel_however_sharp_the_surface():
+    rays, depth, disc = ball_rays(80)
+    t0, t1, _ = g.sphere_interval(rays)
+    soft, sharp = (g.sample_sections(ball_model(zeta), rays, t0, t1, 32, torch.full((80, 32), 0.5)) for zeta in (64.0, 1e4))
+    close(soft, sharp, atol=1e-5)
+
+
+def test_cached_samples_of_an_empty_ray_are_uniform():
+    rays = sphere_rays([(0, 0.9, -3)], [(0, 0, 1)])
+    t0, t1, _ = g.sphere_interval(rays)
+    edges = g.sample_sections(ball_model(), rays, t0, t1, 9, torch.full((1, 9), 0.5))[0]
+    want = t0 + (t1 - t0) * (torch.arange(8) + 0.5) / 8
+    close(edges[1:-1], want, atol=5e-3)
+
+
+@pytest.mark.parametrize("mode", [dict(), dict(sampling="uniform", samples=256), dict(normals="fd")])
+def test_rendering_a_known_ball_finds_its_depth_normal_and_silhouette(mode):
+    rays, depth, disc = ball_rays()
+    model = ball_model(**mode)
+    out = g.render_rays(model, rays, torch.zeros(40, 0), torch.full((40, model.cfg.samples + 4), 0.5))
+    hit, miss = disc > 0.02, disc < -0.02
+    assert hit.sum() > 5 and miss.sum() > 5
+    close(out["depth"][hit], depth[hit], atol=0.012)
+    assert (out["opacity"][hit] > 0.99).all() and (out["opacity"][miss] < 0.01).all()
+    normal = F.normalize(rays.o + depth[:, None] * rays.d - CENTRE, dim=1)
+    close(out["normal"][hit], normal[hit], atol=0.05)
+    close(out["rgb"][hit], torch.full((int(hit.sum()), 3), 0.5), atol=5e-3)
+    close(out["rgb"][miss], model.bg_color.expand(int(miss.sum()), 3), atol=5e-3)
+    close(out["depth"][miss], g.sphere_interval(rays)[1][miss], atol=0.02)
+    assert (out["e_grad"] < 1e-3).all()  # a true distance has no eikonal error
+    close(out["e_curv"][hit], torch.full((int(hit.sum()),), 2 / BALL_R * model.eps), rtol=0.05)
+
+
+def test_rays_that_miss_the_sphere_show_the_background_and_nothing_else():
+    model, rays = ball_model(), sphere_rays([(0, 5, -3), (0, 0, 3)], [(0, 0, 1), (0, 0, 1)])
+    out = g.render_rays(model, rays, torch.zeros(2, 0), torch.rand(2, 52))
+    close(out["rgb"], model.bg_color.expand(2, 3))
+    assert (out["opacity"] == 0).all() and not out["hit"].any()
+    close(out["depth"], [3, 0.1], atol=1e-3)
+
+
+def test_background_is_asked_from_the_exit_of_the_sphere_and_shines_through_what_passes():
+    model, (rays, _, disc) = ball_model(), ball_rays()
+    asked = {}
+
+    def background(rays, start, code, n, jitter):
+        asked.update(start=start, n=n, jitter=jitter)
+        return torch.ones(40, 3)
+    model.background, jitter = background, torch.rand(40, 52)
+    out = g.render_rays(model, rays, torch.zeros(40, 0), jitter)
+    assert torch.equal(asked["start"], g.sphere_interval(rays)[1]) and asked["n"] == 4
+    assert torch.equal(asked["jitter"], jitter[:, 48:])
+    close(out["rgb"], (0.5 * out["opacity"] + 1 - out["opacity"])[:, None].expand(40, 3), atol=1e-5)
+
+
+def test_the_colour_network_sees_feature_unit_normal_direction_and_code():
+    model, (rays, _, _) = ball_model(slope=3.0), ball_rays()
+    seen = []
+    model.color = lambda z: (seen.append(z), torch.zeros(len(z), 3))[1]
+    code = random(40, 5, dtype=torch.float32)
+    g.render_rays(model, rays, code, torch.rand(40, 52))
+    z = seen[0].reshape(40, 48, -1)
+    assert z.shape[2] == g.GEO + 3 + 9 + 5
+    close(z[..., 15:18].reshape(-1, 3), F.normalize(model.sdf.seen[0] - CENTRE, dim=1), atol=1e-5)
+    close(z[..., 18:27], g.sh_basis(rays.d)[:, None].expand(-1, 48, -1))
+    close(z[..., 27:], code[:, None].expand(-1, 48, -1))
+
+
+def test_doubling_the_sdf_and_halving_zeta_changes_nothing_but_the_eikonal_error():
+    (rays, *_), jitter = ball_rays(), torch.rand(40, 52)
+    a, b = (g.render_rays(ball_model(zeta, slope, sampling="uniform"), rays, torch.zeros(40, 0), jitter)
+            for zeta, slope in ((40.0, 1.0), (20.0, 2.0)))
+    assert all(torch.allclose(a[k], b[k], atol=1e-4) for k in ("rgb", "opacity", "depth", "normal"))
+    close(b["e_grad"], b["opacity"], atol=1e-4)  # (2 - 1)^2 where there is something to see
+    close(b["eikonal"], torch.ones(40, 48), atol=1e-4)
+
+
+@pytest.mark.parametrize("alpha", ["neus", "printed"])
+def test_alpha_setting_selects_the_formula(alpha):
+    (rays, _, disc), model = ball_rays(), ball_model(zeta=40.0, alpha=alpha, sampling="uniform", samples=400)
+    out = g.render_rays(model, rays, torch.zeros(40, 0), torch.full((40, 404), 0.5))
+    core = disc > 0.12
+    assert core.sum() > 2
+    assert ((out["opacity"][core] > 0.99) == (alpha == "neus")).all()
+
+
+# ---- 6 mask and geometry preservation ------------------------------------------------------------------
+
+def cgnet(seed=0):
+    torch.manual_seed(seed)
+    return g.CGNet()
+
+
+def test_mask_network_returns_half_the_resolution_in_any_shape():
+    assert cgnet()(torch.rand(2, 3, 32, 48)).shape == (2, 1, 16, 24)
+
+
+def test_mask_network_is_the_same_in_training_and_evaluation_and_alone_or_in_a_batch():
+    net, photo = cgnet(), random(3, 3, 32, 32, dtype=torch.float32)
+    both = [net.train()(photo), net.eval()(photo)]
+    assert torch.equal(*both)
+    close(net(photo[1:2]), both[0][1:2], atol=1e-5)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_mask_starts_small(seed):
+    mask = torch.sigmoid(cgnet(seed)(random(4, 3, 48, 48, seed=seed, dtype=torch.float32)))
+    assert 0.03 < mask.mean().item() < 0.2
+
+
+def test_gradient_reaches_all_of_the_mask_network():
+    net = cgnet()
+    net(random(2, 3, 32, 32, dtype=torch.float32)).square().sum().backward()
+    assert [n for n, p in net.named_parameters() if p.grad is None or not (p.grad != 0).any()] == []
+
+
+def test_mask_is_read_at_the_right_pixel_of_the_right_photo():
+    logits = random(3, 1, 4, 6, low=-3, high=3, dtype=torch.float32)
+    i, j = torch.meshgrid(torch.arange(4), torch.arange(6), indexing="ij")
+    uv = torch.stack([(j + 0.5) / 6, (i + 0.5) / 4], -1).reshape(-1, 2)  # u runs along the width
+    close(g.mask_at(logits, uv.repeat(3, 1)), torch.sigmoid(logits).flatten())
+
+
+def test_mask_between_pixels_is_bilinear_in_the_logits_and_constant_beyond_the_border():
+    logits = torch.tensor([[[[0.0, 1], [2, 5]]]])
+    uv = torch.tensor([[0.5, 0.25], [0.25, 0.5], [0.5, 0.5], [0.0, 0.0], [1.0, 1.0]])
+    close(g.mask_at(logits, uv), torch.sigmoid(torch.tensor([0.5, 1, 2, 0, 5])))
+
+
+def test_bimodality_is_a_pole_at_one_half():
+    mask = torch.linspace(0, 1, 101)
+    pole = torch.stack([g.bimodality(m[None]) for m in mask])
+    close(pole, 1 / ((mask.double() - 0.5) ** 2 + 0.02), rtol=1e-4)
+    assert pole.argmax() == 50
+
+
+def errors(n=200, seed=0):
+    return random(n, seed=seed, high=0.5, dtype=torch.float32), random(n, seed=seed + 1, high=0.5, dtype=torch.float32)
+
+
+def test_literal_edge_indicator_marks_nothing_below_one_half():
+    edge = g.edge_indicator(*errors(), 10.0, 2.0, None)
+    assert (edge >= 0.5).all() and (edge <= 1).all()
+    close(edge, torch.sigmoid(10 * errors()[0] + 2 * errors()[1]))
+
+
+def test_calibrated_edge_indicator_is_half_at_its_centre_and_rises_with_both_errors():
+    calibration, zero = torch.tensor([0.4, 0.1]), torch.zeros(9)
+    rising = torch.linspace(0, 0.1, 9)
+    assert g.edge_indicator(torch.tensor([0.04]), torch.zeros(1), 10.0, 2.0, calibration).item() == pytest.approx(0.5)
+    assert g.edge_indicator(torch.zeros(1), torch.tensor([0.25]), 10.0, 2.0, calibration).item() == \
+        pytest.approx(sigmoid(1.0), abs=1e-6)
+    assert (g.edge_indicator(rising, zero, 10.0, 2.0, calibration).diff() > 0).all()
+    assert (g.edge_indicator(zero, rising, 10.0, 2.0, calibration).diff() > 0).all()
+
+
+@pytest.mark.parametrize("calibration", [None, torch.tensor([0.4, 0.1])])
+def test_edge_indicator_sends_no_gradient_to_the_geometry(calibration):
+    e_grad, e_curv = (e.requires_grad_() for e in errors())
+    assert not g.edge_indicator(e_grad, e_curv, 10.0, 2.0, calibration).requires_grad
+
+
+def test_gpl_loss_is_the_mean_product():
+    mask, edge = errors()
+    assert g.gpl_loss(mask, edge).item() == pytest.approx(
+        sum(m * e for m, e in zip(mask.tolist(), edge.tolist())) / 200, rel=1e-5)
+
+
+def test_calibration_converges_to_the_quantiles_of_the_batch():
+    x, calibration = random(1001, high=3.0, dtype=torch.float32) ** 2, torch.tensor([0.0, 1.0])
+    q = np.quantile(x.numpy(), [0.5, 0.75, 0.95])
+    g.calibrate(x, calibration)
+    close(calibration, [0.05 * q[1], 0.95 + 0.05 * (q[2] - q[0]) / 4], rtol=1e-4)
+    for _ in range(400):
+        g.calibrate(x, calibration)
+    close(calibration, [q[1], (q[2] - q[0]) / 4], rtol=1e-3)
+
+
+def test_calibration_of_equal_signals_keeps_a_positive_width():
+    calibration = torch.tensor([0.0, 1.0])
+    for _ in range(2000):
+        g.calibrate(torch.full((64,), 0.7), calibration)
+    close(calibration, [0.7, 1e-3], rtol=1e-3)
+
+
+# ---- 7 model and objective -----------------------------------------------------------------------------
+
+def test_random_ball_is_uniform():
+    x = g.random_ball(20_000, generator())
+    r = x.norm(dim=1)
+    assert (r <= 1).all()
+    share = np.histogram(r ** 3, np.linspace(0, 1, 11))[0] / 20_000  # sd 0.0021
+    close(share, np.full(10, 0.1), atol=0.012, rtol=0)
+    close(x.mean(0), torch.zeros(3), atol=0.02)
+
+
+def test_every_parameter_is_in_exactly_one_optimiser_group(warm):
+    ids = [id(p) for group in warm.groups() for p in group["params"]]
+    assert sorted(ids) == sorted(id(p) for p in warm.parameters())
+
+
+def test_warm_up_makes_a_sphere(warm):
+    x = g.random_ball(4000, generator(5))
+    with torch.no_grad():
+        error = warm.sdf(x)[0] - (x.norm(dim=1) - 0.5)
+    assert error.square().mean().sqrt() < 0.02
+
+
+def test_cache_is_the_sdf_on_its_grid(warm):
+    n = warm.cache.shape[-1]
+    for i, j, k in ((0, 0, 0), (5, 17, 40), (n - 1, 3, n - 2)):
+        x = torch.tensor([[i, j, k]]) * 2 / (n - 1) - 1
+        assert warm.cache[0, 0, i, j, k].item() == pytest.approx(warm.sdf(x)[0].item(), abs=1e-5)
+
+
+def test_maintenance_refreshes_each_slice_of_the_cache_once_in_64_steps(warm):
+    model, n, done = copy.deepcopy(warm), warm.cache.shape[-1], []
+    model.refresh_cache = lambda part, parts: done.extend(range(part, n, parts))
+    for step in range(64):
+        model.maintain(step, 0.0, None)
+    assert sorted(done) == list(range(n))
+
+
+def test_refreshing_a_part_of_the_cache_leaves_the_rest(warm):
+    model = copy.deepcopy(warm)
+    model.cache.fill_(7)
+    model.refresh_cache(3, 8)
+    fresh = (model.cache[0, 0] != 7).all(2).all(1)
+    assert fresh.nonzero()[:, 0].tolist() == list(range(3, model.cache.shape[-1], 8))
+    assert torch.equal(model.cache[0, 0, 3::8], warm.cache[0, 0, 3::8])
+
+
+@pytest.mark.parametrize("changes", [dict(), dict(normals="fd"), dict(sampling="uniform"), dict(alpha="printed"),
+                                     dict(gpl="literal"), dict(mask="off")])
+def test_every_loss_and_gradient_is_finite(warm, scene, changes):
+    model = copy.deepcopy(warm)
+    model.cfg, model.use_mask = config(**changes), changes.get("mask") != "off"
+    total, logs = model.losses(*batch(scene), 0.5, generator())
+    total.backward()
+    assert all(math.isfinite(float(v)) for v in (total.detach(), *logs.values()))
+    assert all(torch.isfinite(p.grad).all() for p in model.parameters() if p.grad is not None)
+
+
+def tuned(warm, logit=0.5, **changes):
+    """A copy whose remembered masks are worth the name."""
+    model = copy.deepcopy(warm)
+    model.cfg = config(**changes)
+    model.logits.copy_(random(*model.logits.shape, low=logit - 1, high=logit + 1, dtype=torch.float32))
+    return model
+
+
+WEIGHTS = "eik curv lps off sfm".split()
+
+
+@pytest.mark.parametrize("progress, step", [(0.0, 0), (0.5, 1), (0.5, 4)])
+def test_the_objective_is_the_weighted_sum_of_its_terms(warm, scene, progress, step):
+    more = {f"lam_{k}": v for k, v in zip(WEIGHTS, (0.3, 0.7, 0.11, 0.9, 0.5))}
+    model, (rays, pick) = tuned(warm, **more), batch(scene)
+    model.step = step
+    total, raw = model.losses(rays, pick, progress, generator())
+    want = float(raw["rgb"]) + sum(more[f"lam_{k}"] * float(raw[k]) for k in WEIGHTS)
+    if step % model.cfg.mask_every == 0 and progress > 0:
+        want += model.mask_objective(pick).item()
+    assert total.item() == pytest.approx(want, rel=1e-5)
+
+
+def test_raw_terms_of_a_constant_sdf_are_known(warm, scene):
+    """s = 0.03 everywhere: no slope, no curvature, no opacity; only the background is seen."""
+    model = copy.deepcopy(warm)
+    with torch.no_grad():
+        model.sdf.lin2.weight.zero_()
+        model.sdf.lin2.bias.fill_(0.03)
+    _, raw = model.losses(*batch(scene), 0.0, generator())
+    want = dict(eik=1.0, curv=0.0, off=math.exp(-1.5), sfm=0.03, opacity=0.0, mask=0.0, gpl=0.0, zeta=20.0,
+                lps=model.color.bounds().log().sum().item())
+    for key, value in want.items():
+        assert float(raw[key]) == pytest.approx(value, rel=1e-4, abs=1e-6), key
+
+
+def test_the_rgb_term_is_the_unmasked_share_of_the_l1_error(warm, scene):
+    model, (rays, pick), gen = tuned(warm), batch(scene), generator()
+    model.step = 1  # no new logits in this step
+    _, raw = model.losses(rays, pick, 0.5, generator())
+    out = g.render_rays(model, rays, model.appearance(rays.img), torch.rand(64, 12, generator=gen))
+    mask = g.mask_at(model.logits[pick], rays.uv)
+    error = (out["rgb"] - rays.rgb).abs().mean(1)
+    assert float(raw["rgb"]) == pytest.approx(((1 - mask) * error).mean().item(), rel=1e-4)
+    assert float(raw["mse"]) == pytest.approx(((out["rgb"] - rays.rgb) ** 2).mean().item(), rel=1e-4)
+    assert float(raw["mask"]) == pytest.approx(mask.mean().item(), rel=1e-4) and 0.3 < mask.mean() < 0.8
+
+
+@pytest.mark.parametrize("gpl", ["calibrated", "literal"])
+def test_gpl_and_curvature_terms_equal_their_definitions(warm, scene, gpl):
+    model, (rays, pick) = tuned(warm, gpl=gpl, lam_grad=3.0, lam_lap=7.0), batch(scene)
+    model.step, before = 1, model.calibration.clone()
+    _, raw = model.losses(rays, pick, 0.5, generator())
+    out = g.render_rays(model, rays, model.appearance(rays.img), torch.rand(64, 12, generator=generator()))
+    signal = (3 * out["e_grad"] + 7 * out["e_curv"]).detach()
+    g.calibrate(signal, before)
+    close(model.calibration, before)
+    phi = torch.sigmoid(signal if gpl == "literal" else (signal - before[0]) / before[1])
+    want = (g.mask_at(model.logits[pick], rays.uv) * phi * out["opacity"]).mean().item()
+    assert raw["gpl"].item() == pytest.approx(want, rel=1e-4)
+    assert raw["curv"].item() == pytest.approx(out["e_curv"].mean().item(), rel=1e-4)
+
+
+def test_derivatives_are_taken_over_half_a_finest_cell(warm):
+    octree = warm.sdf.octree
+    assert warm.eps == pytest.approx(octree.cell(octree.levels - 1) / 2)
+
+
+def test_the_mask_does_not_act_early_nor_when_it_is_off(warm, scene):
+    for progress, use in ((0.1, True), (0.5, False)):
+        model = tuned(warm)
+        model.use_mask = use
+        total, raw = model.losses(*batch(scene), progress, generator())
+        total.backward()
+        assert float(raw["mask"]) == 0 and all(p.grad is None for p in model.cgnet.parameters())
+
+
+def test_eikonal_term_counts_only_rays_that_meet_the_sphere(warm, scene):
+    rays, pick = batch(scene)
+    away = rays._replace(d=torch.where(torch.arange(64)[:, None] % 2 == 0, rays.d, -rays.d))
+    eik = []
+    for r in (rays, g.Rays(*[v[::2] for v in rays]), away):
+        model = copy.deepcopy(warm)
+        model.cfg = config(sampling="uniform")
+        jitter = torch.full((len(r.o), 12), 0.5)
+        out = g.render_rays(model, r, model.appearance(r.img), jitter)
+        eik.append((out["eikonal"].mean(1) * out["hit"]).sum() / out["hit"].sum())
+    close(eik[1], eik[2])
+    gen = generator()
+    out = g.render_rays(warm, away, warm.appearance(away.img), torch.rand(64, 12, generator=generator()))
+    _, raw = copy.deepcopy(warm).losses(away, pick, 0.0, gen)
+    hit = out["hit"]
+    assert 0 < hit.sum() <= 32 and float(raw["eik"]) == pytest.approx(out["eikonal"][hit].mean().item(), rel=1e-4)
+
+
+def test_off_surface_and_sfm_terms_equal_their_definitions(warm, scene):
+    gen = generator()
+    torch.rand(64, 12, generator=gen)
+    points = warm.sfm[torch.randint(len(warm.sfm), (32,), generator=gen)]
+    ball = g.random_ball(32, gen)
+    _, raw = copy.deepcopy(warm).losses(*batch(scene), 0.0, generator())
+    assert float(raw["off"]) == pytest.approx((-50 * warm.sdf(ball)[0].abs()).exp().mean().item(), rel=1e-4)
+    assert float(raw["sfm"]) == pytest.approx(warm.sdf(points)[0].abs().mean().item(), rel=1e-4)
+
+
+def test_errors_are_remembered_where_the_mask_network_looks_for_them(warm, scene):
+    model, (rays, _) = copy.deepcopy(warm), batch(scene)
+    rays = rays._replace(img=torch.tensor([3, 5]), uv=torch.tensor([[0.9, 0.1], [0.0, 1.0]]))  # u along the width
+    model.seen.fill_(-1)
+    model.remember(rays, torch.tensor([0.7, 0.2]), torch.tensor([0.4, 0.1]))
+    m = model.seen.shape[-1]
+    close(model.seen[3, :, m // 10, 9 * m // 10], [0.7, 0.4])
+    close(model.seen[5, :, m - 1, 0], [0.2, 0.1])
+    assert (model.seen[:, 0] >= 0).sum() == 2
+
+
+def test_where_rays_ended_is_remembered_with_what_the_mask_does_not_explain(warm, scene):
+    model, (rays, pick), jitter = tuned(warm), batch(scene), torch.rand(64, 12, generator=generator())
+    n = len(model.hits) // 64
+    mask = g.mask_at(model.logits[pick], rays.uv)
+    for model.step in (1, 3, n + 3):  # after n steps the slots are filled anew
+        model.hits.fill_(2)
+        model.losses(rays, pick, 0.5, generator())
+        out = g.render_rays(model, rays, model.appearance(rays.img), jitter)
+        error = (1 - mask) * (out["rgb"] - rays.rgb).abs().mean(1)
+        slot = model.step % n * 64
+        close(model.hits[slot:slot + 64], torch.cat([out["x"], error[:, None]], 1), atol=1e-5)
+        assert (model.hits[:, 0] < 2).sum() == 64
+        close(out["x"], rays.o + out["depth"][:, None] * rays.d, atol=1e-5)
+
+
+def test_level_is_the_running_median_of_the_error(warm, scene):
+    model, (rays, pick) = copy.deepcopy(warm), batch(scene)
+    model.level.fill_(5.0)
+    model.losses(rays, pick, 0.0, generator())
+    out = g.render_rays(model, rays, model.appearance(rays.img), torch.rand(64, 12, generator=generator()))
+    median = (out["rgb"] - rays.rgb).abs().mean(1).sort().values[31].item()  # the lower one
+    assert model.level.item() == pytest.approx(0.98 * 5 + 0.02 * median, rel=1e-5)
+
+
+def price_of_masking(model, error, edge):
+    """What M = 1 costs a pixel: intensity, threshold of usual errors and GPL, less the error that it saves."""
+    return model.cfg.lam_mask + 2 * model.level.item() + model.cfg.lam_gpl * edge - error
+
+
+def test_the_mask_objective_equals_a_naive_loop_over_what_is_known(warm):
+    model, pick = tuned(warm, lam_gpl=0.3, lam_mask=0.1, lam_bimodal=1e-2), torch.tensor([2, 0])
+    model.level.fill_(0.05)
+    known = random(2, 16, 16, seed=1) < 0.6
+    error, edge = random(2, 16, 16, seed=2), random(2, 16, 16, seed=3)
+    model.seen[pick] = torch.where(known[:, None], torch.stack([error, edge], 1), -1.0).float()
+    logits = model.cgnet(model.scene.thumbs[pick].float() / 255)[:, 0]
+    want, n = 0.0, 2 * 16 * 16
+    for b, i, j in itertools.product(range(2), range(16), range(16)):
+        logit, around = logits[b, i, j].item(), (b, slice(max(i - 1, 0), i + 2), slice(max(j - 1, 0), j + 2))
+        if known[b, i, j]:  # worth masking where the price of M is negative
+            mean_error = error[around][known[around]].mean().item()  # over 3x3 pixels
+            price = price_of_masking(model, mean_error, edge[b, i, j].item())
+            want += abs(price) * math.log1p(math.exp(logit if price > 0 else -logit)) / n
+        want += 1e-2 / ((sigmoid(logit) - 0.5) ** 2 + 0.02) / n
+    assert model.mask_objective(pick).item() == pytest.approx(want, rel=1e-4)
+    close(model.logits[pick][:, 0], logits.detach(), atol=1e-5)
+
+
+class FreeLogits(nn.Module):
+    """Stands in for the mask network: every pixel's logit is its own, from the 8 % that CGNet starts with."""
+
+    def __init__(self, shape):
+        super().__init__()
+        self.logits = nn.Parameter(torch.full(shape, -2.5))
+
+    def forward(self, photo):
+        return self.logits
+
+
+def test_a_pixel_is_masked_when_its_error_is_above_its_price_and_only_then(warm):
+    model, pick = tuned(warm, lam_gpl=0.05, lam_mask=0.06), torch.tensor([0])
+    model.level.fill_(0.02)
+    model.cgnet = FreeLogits((1, 1, 16, 16))
+    model.seen[0, 0], model.seen[0, 1] = torch.linspace(0, 0.5, 16)[:, None], 0.0
+    model.seen[0, 1, :, 8:] = 1.0
+    adam = torch.optim.Adam(model.cgnet.parameters(), lr=0.1)
+    for _ in range(300):
+        adam.zero_grad()
+        model.mask_objective(pick).backward()
+        adam.step()
+    error, edge = model.seen[0]
+    excess, mask = -price_of_masking(model, error, edge), torch.sigmoid(model.cgnet.logits[0, 0])
+    assert (mask[excess > 0.02] > 0.95).all() and (mask[excess < -0.02] < 0.05).all()
+    assert ((excess > 0.02).sum(0) > 8).all() and ((excess < -0.02).sum(0) > 2).all()
+
+
+def mask_gradient(warm, level=0.0, **changes):
+    """Gradient at the bias of the mask where all errors are 0.1 and all edges are certain."""
+    model, pick = tuned(warm, **dict(lam_gpl=0.0, lam_mask=0.0, lam_bimodal=0.0) | changes), torch.tensor([0, 1])
+    model.seen[:, 0], model.seen[:, 1] = 0.1, 1.0
+    model.level.fill_(level)
+    model.mask_objective(pick).backward()
+    return model.cgnet.heads[0].bias.grad.item()
+
+
+def test_error_raises_the_mask_and_its_price_and_gpl_hold_it_back(warm):
+    assert mask_gradient(warm) < 0
+    assert mask_gradient(warm, lam_mask=0.1) == pytest.approx(0, abs=1e-6)  # the threshold itself
+    assert mask_gradient(warm, lam_mask=0.2) > 0 < mask_gradient(warm, lam_gpl=0.2)
+    assert mask_gradient(warm, level=0.2) > 0  # where such errors are usual
+
+
+def test_the_mask_learns_from_errors_but_the_geometry_never_from_the_mask(warm, scene):
+    grads = []
+    for lam in (0.0, 5.0):
+        model = tuned(warm, lam_gpl=lam)
+        total, _ = model.losses(*batch(scene), 0.5, generator())
+        total.backward()
+        grads.append((model.sdf.lin1.weight.grad, model.cgnet.heads[0].bias.grad))
+    assert torch.equal(grads[0][0], grads[1][0])
+    assert grads[1][1].item() > grads[0][1].item()
+
+
+def test_the_mask_of_rays_is_the_networks_opinion_or_zero(warm, scene):
+    model, (rays, pick) = copy.deepcopy(warm), batch(scene)
+    close(model.mask_of(rays, pick), g.mask_at(model.cgnet(scene.thumbs[pick].float() / 255), rays.uv))
+    model.use_mask = False
+    assert torch.equal(model.mask_of(rays, pick), torch.zeros(64))
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_one_bad_batch_does_not_poison_what_the_model_remembers(warm, scene, monkeypatch, value):
+    model, render = copy.deepcopy(warm), g.render_rays
+    bad = {"e_grad", "e_curv", "rgb", "x"}
+    monkeypatch.setattr(g, "render_rays", lambda *a: {k: v * value if k in bad else v for k, v in render(*a).items()})
+    model.losses(*batch(scene), 0.5, generator())
+    monkeypatch.setattr(g, "render_rays", render)
+    model.step += 1
+    total, _ = model.losses(*batch(scene, seed=1), 0.5, generator(1))
+    assert math.isfinite(total.item())
+    assert all((b.abs() < 1e15).all() for b in model.buffers())
+
+
+def new_model(scene, seed=0, **changes):
+    torch.manual_seed(seed)
+    return g.GeoNVS(config(seed=seed, **changes), scene, generator(seed))
+
+
+def with_facts(scene, **facts):
+    return scene._replace(raw=scene.raw | {k: np.array(v) for k, v in facts.items()})
+
+
+def test_appearance_off_costs_no_numbers(scene):
+    model = new_model(scene, appearance="off")
+    total, _ = model.losses(*batch(scene), 0.0, generator())
+    assert model.codes().numel() == 0 and math.isfinite(total.item())
+
+
+def test_background_off_shows_one_colour(scene):
+    model = new_model(scene, background="off")
+    rays, pick = batch(scene)
+    out = model.render(rays, model.appearance(rays.img))
+    assert model.background is None and len(model.octrees()) == 1
+    miss = ~out["hit"]
+    assert miss.any()
+    close(out["rgb"][miss], model.bg_color.expand(int(miss.sum()), 3))
+
+
+def test_a_scene_without_points_works(scene):
+    bare = scene._replace(points=scene.points[:0])
+    model = new_model(bare)
+    total, raw = model.losses(*batch(bare), 0.5, generator())
+    total.backward()
+    assert math.isfinite(total.item()) and float(raw["sfm"]) == 0
+
+
+def test_one_exposure_and_one_background_colour_switch_their_parts_off(scene):
+    model = new_model(with_facts(scene, exposure_spread=0.001, bg_color=[0.2, 0.4, 0.6]))
+    assert model.codes().shape[1] == 0 and model.background is None
+    close(model.bg_color, [0.2, 0.4, 0.6])
+    model = new_model(with_facts(scene, exposure_spread=0.1, bg_color=[math.nan] * 3))
+    assert model.codes().shape[1] == 4 and model.background is not None
+
+
+def test_settings_overrule_what_the_scene_needs(scene):
+    model = new_model(with_facts(scene, exposure_spread=0.0, bg_color=[0.2] * 3), appearance="on", background="on")
+    assert model.codes().shape[1] == 4 and model.background is not None
+
+
+def test_levels_come_from_the_footprint_unless_given(scene):
+    assert new_model(with_facts(scene, footprint=0.03), levels=0).sdf.octree.levels == g.levels_for_footprint(0.03)
+
+
+def test_appearance_changes_colours_and_never_the_geometry(warm, scene):
+    rays, _ = batch(scene)
+    a, b = (warm.render(rays, torch.full((64, 4), v)) for v in (-2.0, 2.0))
+    assert (a["rgb"] != b["rgb"]).any()
+    assert all(torch.equal(a[k], b[k]) for k in ("depth", "opacity", "normal"))
+
+
+class Refinable(SimpleNamespace):
+    """What GeoNVS.refine needs: a tree, the SDF of the ball, remembered hits and an optimiser."""
+
+
+def refinable(levels=4, **changes):
+    octree = g.Octree(1.0, levels, 2, root=8)
+    g.seed_octree(octree, torch.zeros(0, 3), 2, (0.0, 0.9))  # levels 0 and 1 split everywhere
+    model = Refinable(cfg=config(**changes), sdf=Ball(), hits=torch.full((64, 4), 2.0))
+    model.sdf.octree = octree
+    model.optimizer = torch.optim.Adam([dict(params=[octree.features], lr=0.01)])
+    octree.features[1:].sum().backward()
+    model.optimizer.step()
+    state = model.optimizer.state[octree.features]
+    state["exp_avg"][:, 0] = octree.row_key.float()  # a mark by which to know each row again
+    return model
+
+
+def hit_the_ball(model, n, error, direction=(0.3, -0.5, 0.8)):
+    at = CENTRE + BALL_R * F.normalize(torch.tensor([direction]), dim=1)
+    model.hits[:n] = torch.cat([at, torch.tensor([[error]])], 1)
+    return at
+
+
+def distance_to_cells(octree, level, keys):
+    cells = octree.cells[level][torch.isin(octree.key(octree.cells[level], level), keys)]
+    return Ball()((cells + 0.5) * octree.cell(level) - 1)[0].abs()
+
+
+def test_refining_prunes_cells_far_from_the_surface_and_only_those():
+    model = refinable()
+    octree = model.sdf.octree
+    before = octree.split_keys[0].clone(), octree.split_keys[1].clone()
+    g.GeoNVS.refine(model, model.optimizer)
+    reach = (math.sqrt(3) / 2 + 1) * octree.cell(1)
+    assert torch.equal(octree.split_keys[0], before[0])  # the coarsest level stays
+    gone = before[1][~torch.isin(before[1], octree.split_keys[1])]
+    assert len(gone) > 0 < len(octree.split_keys[1])
+    assert (distance_to_cells(octree, 1, octree.split_keys[1]) < reach).all()
+    assert (distance_to_cells(octree, 1, gone) >= reach).all()
+    assert len(octree.cells[3]) == 0  # nothing was hit, nothing is finer
+
+
+def test_refining_splits_where_rays_miss_their_colour_and_nowhere_else():
+    for error, want in ((0.5, True), (0.01, False)):
+        model = refinable(split_error=0.02)
+        at = hit_the_ball(model, 5, error)
+        g.GeoNVS.refine(model, model.optimizer)
+        octree = model.sdf.octree
+        assert (len(octree.cells[3]) > 0) == want
+    model = refinable(split_error=0.02)
+    at = hit_the_ball(model, 5, 0.5)
+    g.GeoNVS.refine(model, model.optimizer)
+    octree = model.sdf.octree
+    corner, _ = octree.locate(at)
+    assert (corner > 0).all()  # no hanging corner beside the hit
+    split = octree.cells[2][torch.isin(octree.key(octree.cells[2], 2), octree.split_keys[2])]
+    assert len(split) <= 27 and (split - octree.cell_of(at, 2)).abs().max() == 1
+
+
+def test_refining_never_splits_far_from_the_surface_whatever_the_error():
+    model = refinable()
+    g.GeoNVS.refine(model, model.optimizer)  # far cells are whole now
+    model.hits[:5] = torch.tensor([-0.8, 0.8, -0.8, 0.9])
+    g.GeoNVS.refine(model, model.optimizer)
+    octree = model.sdf.octree
+    home = octree.key(octree.cell_of(model.hits[:1, :3], 1), 1)
+    assert not torch.isin(home, octree.split_keys[1]).any() and len(octree.cells[3]) == 0
+
+
+def test_refining_judges_cells_by_their_mean_error():
+    model = refinable(split_error=0.3)
+    hit_the_ball(model, 4, 0.0)
+    hit_the_ball(model, 1, 1.0)  # a mean of 0.25
+    g.GeoNVS.refine(model, model.optimizer)
+    assert len(model.sdf.octree.cells[3]) == 0
+
+
+def test_refining_without_pruning_does_not_change_the_function(monkeypatch):
+    model = refinable()
+    monkeypatch.setattr(model.sdf.__class__, "__call__", lambda self, x: (0 * x[:, 0], None))  # surface everywhere
+    hit_the_ball(model, 5, 0.5)
+    x = random(300, 3, low=-1, dtype=torch.float32)
+    before, n = model.sdf.octree(x), len(model.sdf.octree.cells[3])
+    g.GeoNVS.refine(model, model.optimizer)
+    assert n < len(model.sdf.octree.cells[3]) <= 8 * 27 and torch.equal(model.sdf.octree(x), before)
+
+
+def test_refining_stays_within_its_memory_and_takes_the_worst_first():
+    model = refinable()
+    g.GeoNVS.refine(model, model.optimizer)  # pruned once, so that only growth is left
+    octree = model.sdf.octree
+    hit_the_ball(model, 60, 0.1)
+    worst = hit_the_ball(model, 20, 0.9, (-1.0, 0.2, 0.1))
+    full = octree.bytes() / 2 ** 20
+    model.cfg = config(max_mb=full)
+    g.GeoNVS.refine(model, model.optimizer)
+    assert len(octree.cells[3]) == 0
+    model.cfg = config(max_mb=full + 20 * 512 / 2 ** 20)
+    g.GeoNVS.refine(model, model.optimizer)
+    assert 0 < len(octree.cells[3]) <= 8 * 20
+    assert ((octree.cells[3] // 2 - octree.cell_of(worst, 2)).abs().amax(1) <= 1).all()
+
+
+def test_adams_moments_move_with_their_features():
+    model = refinable()
+    octree, rate = model.sdf.octree, model.optimizer.state[model.sdf.octree.features]["step"].item()
+    old = octree.row_key.clone()
+    hit_the_ball(model, 5, 0.5)
+    g.GeoNVS.refine(model, model.optimizer)
+    state = model.optimizer.state[octree.features]
+    kept = torch.isin(octree.row_key, old)
+    assert kept.any() and not kept.all()
+    assert torch.equal(state["exp_avg"][kept, 0], octree.row_key[kept].float())
+    assert (state["exp_avg"][~kept] == 0).all() and (state["exp_avg_sq"][~kept] == 0).all() and state["step"] == rate
+    assert model.optimizer.param_groups[0]["params"][0] is octree.features and len(model.optimizer.state) == 1
+    octree.features.sum().backward()
+    before = octree.features.detach().clone()
+    model.optimizer.step()
+    assert not torch.equal(octree.features, before)
+
+
+def test_the_model_is_refined_at_its_moments_and_drops_an_empty_mask(warm):
+    model, calls = copy.deepcopy(warm), []
+    model.refine = lambda optimizer: calls.append(round(progress, 2))
+    for step in range(100):
+        progress = step / 100
+        model.maintain(step, progress, None)
+    assert calls == [0.1, 0.2, 0.3, 0.45, 0.6] and model.use_mask is False  # its logits never moved
+    model = copy.deepcopy(warm)
+    model.refine, model.refined = lambda optimizer: None, 4
+    model.logits[:2] = 2.0
+    model.maintain(0, 0.9, None)
+    assert model.use_mask
+
+
+def test_a_uniform_grid_is_fine_everywhere_in_the_sphere_and_stays_so(scene):
+    model = new_model(scene, grid="uniform")
+    octree, x = model.sdf.octree, g.random_ball(500, generator())
+    assert torch.isin(octree.key(octree.cell_of(x, 0), 0), octree.split_keys[0]).all()
+    model.refine = None  # would fail if it were called
+    model.maintain(0, 0.9, None)
+    assert model.refined == 1
+
+
+# ---- 8 baselines ---------------------------------------------------------------------------------------
+
+BASELINE = dict(rays=16, photos=16, samples=6, hidden=32)
+
+
+def baseline(scene, kind, **changes):
+    torch.manual_seed(0)
+    settings = BASELINE | dict(photos=1, rays=256) if kind == "hanerf" else BASELINE
+    return g.METHODS[kind][0](config(method=kind, **settings | changes), scene, generator())
+
+
+def test_positional_encoding_equals_a_naive_loop():
+    x = random(5, 2, low=-2)
+    got = g.positional(x, 3)
+    for p in range(5):
+        want = [*x[p].tolist()] + [f(2 ** k * v) for f in (math.sin, math.cos) for v in x[p].tolist() for k in range(3)]
+        assert sorted(got[p].tolist()) == pytest.approx(sorted(want)) and got[p, :2].tolist() == x[p].tolist()
+
+
+@pytest.mark.parametrize("kind", ["nerfw", "hanerf"])
+def test_baselines_train_on_finite_losses_that_reach_every_part(scene, kind):
+    model = baseline(scene, kind)
+    rays, pick = model.batch(torch.nonzero(~scene.is_test)[:, 0], generator())
+    total, logs = model.losses(rays, pick, 0.5, generator())
+    total.backward()
+    assert all(math.isfinite(float(v)) for v in (total.detach(), *logs.values())) and {"mse", "mask"} <= logs.keys()
+    lost = [n for n, p in model.named_parameters() if p.grad is None or not torch.isfinite(p.grad).all()]
+    if kind == "hanerf":
+        lost = [n for n in lost if n != "appearance.weight"]
+    assert lost == []
+
+
+def rendered(model, scene, transient=None):
+    rays, _ = batch(scene, 12, 4)
+    return rays, model.render(rays, random(12, 48, dtype=torch.float32), random(12, 12, dtype=torch.float32), transient)
+
+
+@pytest.mark.parametrize("kind", ["nerfw", "hanerf"])
+def test_baseline_weights_sum_to_one_and_depths_are_within_reach(scene, kind):
+    model = baseline(scene, kind)
+    rays, out = rendered(model, scene)
+    close(out["w"].sum(1), torch.ones(12), atol=1e-4)  # the last section is opaque
+    assert out["w"].shape == (12, 12) and (out["depth"] >= rays.near).all() and (out["depth"] <= model.far).all()
+    assert (out["rgb"] >= 0).all() and (out["rgb"] <= 1.001).all()
+
+
+def test_nerfw_without_transient_density_is_the_static_picture(scene):
+    model = baseline(scene, "nerfw")
+    with torch.no_grad():
+        model.head_out.weight.zero_()
+        model.head_out.bias.copy_(torch.tensor([-100.0, 0, 0, 0, 3]))
+    _, static = rendered(model, scene)
+    _, both = rendered(model, scene, torch.zeros(12, 16))
+    close(both["rgb"], static["rgb"], atol=1e-4)
+    close(both["transient"], torch.zeros(12))
+    close(both["beta"], torch.full((12,), 0.03))
+
+
+def test_nerfw_behind_a_dense_transient_sees_only_the_transient(scene):
+    model = baseline(scene, "nerfw")
+    with torch.no_grad():
+        model.fine.density.bias.fill_(-50.0)
+        model.head_out.weight.zero_()
+        model.head_out.bias.copy_(torch.tensor([100.0, 1, 1, 1, 3]))
+    _, out = rendered(model, scene, torch.zeros(12, 16))
+    close(out["rgb"], torch.full((12, 3), sigmoid(1.0)), atol=1e-3)
+    close(out["transient"], torch.ones(12), atol=1e-3)
+    close(out["beta"], torch.full((12,), math.log1p(math.exp(3)) + 0.03), atol=1e-2)
+
+
+def test_nerfw_mixes_static_and_transient_as_its_equation_says(scene):
+    """Naive loop in float64 over the sections of one ray (NeRF-W Eq. 5)."""
+    model, (rays, _) = baseline(scene, "nerfw"), batch(scene, 4, 4)
+    t = (1.5 + random(4, 5).cumsum(1)).float()
+    code, transient = random(4, 48, seed=1, dtype=torch.float32), random(4, 16, seed=2, dtype=torch.float32)
+    out = model.pass_through(model.fine, rays, t, code, transient)
+    sigma, rgb, neck = model.fine(rays.o[:, None] + t[:, :, None] * rays.d[:, None], rays.d, code)
+    head = model.head_out(model.head(torch.cat([neck, transient[:, None].expand(-1, 5, -1)], 2)))
+    for r in range(4):
+        left, total, beta = 1.0, torch.zeros(3), 0.03
+        for j in range(5):
+            dt = (t[r, j + 1] - t[r, j]).item() if j < 4 else 100.0
+            st = math.log1p(math.exp(head[r, j, 0].item()))
+            a_s, a_t = 1 - math.exp(-sigma[r, j].item() * dt), 1 - math.exp(-st * dt)
+            total = total + left * (a_s * rgb[r, j] + a_t * torch.sigmoid(head[r, j, 1:4]))
+            beta += left * a_t * math.log1p(math.exp(head[r, j, 4].item()))
+            left *= math.exp(-(sigma[r, j].item() + st) * dt)
+        close(out["rgb"][r], total, atol=1e-4)
+        assert out["beta"][r].item() == pytest.approx(beta, abs=1e-4)
+
+
+def test_nerfw_fine_samples_gather_where_the_coarse_weights_are(scene):
+    model, (rays, _), seen = baseline(scene, "nerfw"), batch(scene, 12, 4), []
+
+    def pass_through(field, rays, t, code, transient):
+        seen.append((field, t))
+        return dict(rgb=torch.zeros(12, 3), w=F.one_hot(torch.full((12,), 2), t.shape[1]).float())
+    model.pass_through = pass_through
+    model.render(rays, torch.zeros(12, 48), torch.rand(12, 12))
+    (first, coarse), (second, fine) = seen
+    assert first is model.coarse and second is model.fine and (fine.diff(dim=1) >= 0).all()
+    section = ((fine - rays.near[:, None]) / (model.far - rays.near[:, None]) * 6).floor()
+    assert coarse.shape == (12, 6) and ((section == 2).sum(1) >= 6).all()  # one of the first and nearly all of the second pass
+
+
+def test_nerfw_loss_is_its_equation_13(scene):
+    model, (rays, pick) = baseline(scene, "nerfw"), batch(scene, 16, 16)
+    total, raw = model.losses(rays, pick, 0.0, generator())
+    out = model.render(rays, model.codes()[rays.img], torch.rand(16, 12, generator=generator()), model.transient(rays.img))
+    want = 0.0
+    for i in range(16):
+        e, b = ((out["rgb"][i] - rays.rgb[i]) ** 2).sum().item(), out["beta"][i].item()
+        want += (e / (2 * b * b) + 3 + math.log(b) + 0.01 * out["sigma_t"][i].item()) / 16
+    want += ((out["coarse"] - rays.rgb) ** 2).mean().item() / 2
+    assert total.item() == pytest.approx(want, rel=1e-4)
+
+
+def test_hanerf_draws_a_row_major_window_of_one_photo(scene):
+    model = baseline(scene, "hanerf")
+    for seed in range(5):
+        rays, pick = model.batch(torch.nonzero(~scene.is_test)[:, 0], generator(seed))
+        uv = rays.uv.reshape(16, 16, 2)
+        assert set(rays.img.tolist()) == {pick.item()} and not scene.is_test[pick]
+        assert (uv[:, 1:, 0] >= uv[:, :-1, 0]).all() and (uv[1:, :, 1] >= uv[:-1, :, 1]).all()
+        assert (uv[:, :, 0] == uv[:1, :, 0]).all() and (uv[:, :, 1] == uv[:, :1, 1]).all()
+        assert (uv[0, -1, 0] - uv[0, 0, 0]) > 0.4
+
+
+def test_hanerf_mask_lowers_the_colour_loss_and_has_a_falling_price(scene):
+    model = baseline(scene, "hanerf", steps=10_000)
+    rays, pick = model.batch(torch.nonzero(~scene.is_test)[:, 0], generator())
+    sizes = [float(model.losses(rays, pick, p, generator())[1]["size"]) for p in (0.0, 0.1, 1.0)]
+    mask = model.mask_of(rays, pick)
+    close(sizes, [5e-2 * (mask ** 2).mean(), 5e-2 / math.e * (mask ** 2).mean(), 6e-3 * (mask ** 2).mean()], rtol=1e-3)
+
+
+def test_hanerf_codes_come_from_the_photos_in_any_batch(scene):
+    model = baseline(scene, "hanerf")
+    codes = model.codes()
+    assert codes.shape == (10, 48) and not codes.requires_grad
+    close(codes[7], model.encode(torch.tensor([7]))[0], atol=1e-5)
+
+
+# ---- 9 energy meter ------------------------------------------------------------------------------------
+
+class Bench:
+    """A clock, a counter and a power reading that tests turn by hand."""
+
+    def __init__(self, watts=lambda t: 50.0, scale=1.0, **kwargs):
+        self.t, self.j, self.watts = 0.0, 0.0, watts
+        self.meter = g.EnergyMeter("fake", kwargs.pop("counter", lambda: self.j), kwargs.pop(
+            "power", lambda: watts(self.t) * scale), period=1e9, clock=lambda: self.t, **kwargs)
+
+    def work(self, seconds, joules, ticks=1):
+        for _ in range(ticks):
+            self.t, self.j = self.t + seconds / ticks, self.j + joules / ticks
+            self.meter.tick()
+
+    def window(self, *args, **kwargs):
+        self.meter.start()
+        self.work(*args, **kwargs)
+        self.meter.stop()
+
+
+def test_meter_of_constant_power_reads_power_times_time():
+    bench = Bench()
+    bench.window(72, 3600, ticks=5)
+    report = bench.meter.report()
+    assert report["energy_wh"] == pytest.approx(1) and report["energy_wh_sampled"] == pytest.approx(1)
+    assert report["energy_source"] == "fake" and report["idle_w"] == 50 and report["energy_disagrees"] is False
+
+
+def test_meter_integrates_a_ramp_by_trapezoids():
+    bench = Bench(watts=lambda t: 3 * t)
+    bench.window(10, 150, ticks=4)
+    assert bench.meter.sampled_joules == pytest.approx(150)
+
+
+def test_meter_flags_readings_that_disagree_by_more_than_five_percent():
+    for scale, want in ((1.04, False), (1.2, True), (0.8, True)):
+        bench = Bench(scale=scale)
+        bench.window(10, 500)
+        assert bench.meter.report()["energy_disagrees"] is want
+
+
+def test_meter_counts_across_a_wrap():
+    bench = Bench(wrap=100.0, power=None)
+    bench.meter.counter, bench.j = (lambda: bench.j % 100), 90
+    bench.window(3, 30, ticks=3)
+    assert bench.meter.joules == pytest.approx(30)
+
+
+def test_meter_windows_add_up_and_what_lies_between_is_left_out():
+    bench = Bench()
+    bench.window(10, 500)
+    bench.t, bench.j = bench.t + 1000, bench.j + 77_777
+    bench.window(20, 1000, ticks=2)
+    assert bench.meter.joules == pytest.approx(1500) and bench.meter.sampled_joules == pytest.approx(1500)
+
+
+def test_meter_without_readings_reports_none_and_never_zero():
+    meter = g.EnergyMeter()
+    meter.start()
+    meter.stop()
+    assert all(v is None for v in meter.report().values())
+
+
+def test_meter_with_one_reading_reports_that_one():
+    counter, power = Bench(power=None), Bench(counter=None)
+    for bench in (counter, power):
+        bench.window(72, 3600)
+    assert counter.meter.report()["energy_wh"] == pytest.approx(1) and counter.meter.report()["energy_wh_sampled"] is None
+    assert power.meter.report()["energy_wh"] == pytest.approx(1) and power.meter.report()["energy_disagrees"] is None
+
+
+def test_meter_thread_ticks_and_ends():
+    ticks = []
+    meter = g.EnergyMeter("fake", power=lambda: 1.0, period=1e-3, clock=lambda: ticks.append(0) or len(ticks))
+    meter.start()
+    while len(ticks) < 5:
+        pass
+    meter.stop()
+    assert not meter.thread.is_alive() and meter.sampled_joules == len(ticks) - 1
+
+
+def powercap(root, packages, wrap=1_000_000):
+    for name, energy in packages.items():
+        (root / name).mkdir(exist_ok=True)
+        (root / name / "energy_uj").write_text(f"{energy}\n")
+        (root / name / "max_energy_range_uj").write_text(f"{wrap}\n")
+
+
+def test_rapl_sums_packages_each_with_its_own_wrap_and_skips_their_parts(tmp_path):
+    powercap(tmp_path, {"intel-rapl:0": 900_000, "intel-rapl:1": 100_000, "intel-rapl:0:0": 5, "other": 9})
+    meter = g.rapl_meter(str(tmp_path))
+    meter.period = 1e9
+    meter.start()
+    powercap(tmp_path, {"intel-rapl:0": 200_000, "intel-rapl:1": 150_000, "intel-rapl:0:0": 999_999})
+    meter.tick()
+    powercap(tmp_path, {"intel-rapl:0": 300_000, "intel-rapl:1": 150_000})
+    meter.stop()
+    assert meter.joules == pytest.approx(0.3 + 0.05 + 0.1) and meter.source == "rapl"
+
+
+def test_rapl_without_packages_reads_none(tmp_path):
+    assert g.rapl_meter(str(tmp_path)).report()["energy_wh"] is None
+
+
+def nvml(monkeypatch, **more):
+    """A GPU that has spent 7 J and draws 30 W, as pynvml would tell it."""
+    calls = dict(nvmlInit=lambda: None, nvmlDeviceGetHandleByUUID=lambda uuid: uuid,
+                 nvmlDeviceGetTotalEnergyConsumption=lambda gpu: 7000, nvmlDeviceGetPowerUsage=lambda gpu: 30_000)
+    monkeypatch.setitem(sys.modules, "pynvml", SimpleNamespace(**calls | more))
+    monkeypatch.setattr(torch.cuda, "get_device_properties", lambda device: SimpleNamespace(uuid="abc"))
+    return g.make_meter(torch.device("cuda"))
+
+
+def test_nvml_is_asked_for_torchs_gpu_in_millijoules_and_milliwatts(monkeypatch):
+    asked = []
+    meter = nvml(monkeypatch, nvmlDeviceGetHandleByUUID=asked.append)
+    assert meter.source == "nvml" and meter.counter() == 7 and meter.idle_w == 30
+    assert asked in (["GPU-abc"], [b"GPU-abc"])
+
+
+def test_gpu_without_pynvml_reads_none(monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "pynvml", None)
+    assert g.make_meter(torch.device("cuda")).report()["energy_wh"] is None
+    assert capsys.readouterr().out.count("\n") == 1
+
+
+# ---- 10 training ---------------------------------------------------------------------------------------
+
+def run_training(scene, run, seed=0, saved=None, **changes):
+    run.mkdir(exist_ok=True)
+    return g.train(config(seed=seed, **changes), scene, run, saved)
+
+
+def weights(model):
+    return {k: v for k, v in model.state_dict().items() if torch.is_tensor(v)}
+
+
+def same_weights(a, b):
+    a, b = weights(a), weights(b)
+    return a.keys() == b.keys() and all(torch.equal(a[k], b[k]) for k in a)
+
+
+def last_log(run):
+    line = json.loads((run / "log.jsonl").read_text().splitlines()[-1])
+    return {k: v for k, v in line.items() if k != "seconds"}
+
+
+@pytest.fixture(scope="module")
+def six(scene, tmp_path_factory):
+    """Six steps in one go, with a copy of the checkpoint that was written after each."""
+    run = tmp_path_factory.mktemp("six")
+    with pytest.MonkeyPatch.context() as patch:
+        start, save = g.GeoNVS.start, g.save_checkpoint
+
+        def keep(path, *args):
+            save(path, *args)
+            shutil.copy(path, run / f"after_{args[-1]['step']}.pt")
+        patch.setattr(g.GeoNVS, "start", lambda self, gen: start(self, gen, 3))
+        patch.setattr(g, "CHECKPOINT_S", -1.0)  # after every step
+        patch.setattr(g, "save_checkpoint", keep)
+        model, state, _ = run_training(scene, run)
+    return SimpleNamespace(run=run, model=model, state=state)
+
+
+def test_training_counts_its_steps_and_logs_them(six):
+    assert six.state["step"] == six.model.step == 6 and six.state["dropped"] == 0
+    assert last_log(six.run)["step"] == 6 and {"psnr", "zeta", "mask", "rgb", "eik"} <= last_log(six.run).keys()
+
+
+def test_the_same_seed_repeats_bit_for_bit_and_another_does_not(scene, tmp_path, brief, six):
+    again, *_ = run_training(scene, tmp_path / "again")
+    other, *_ = run_training(scene, tmp_path / "other", seed=1)
+    assert same_weights(six.model, again) and last_log(six.run) == last_log(tmp_path / "again")
+    assert not torch.equal(other.sdf.lin1.weight, again.sdf.lin1.weight)
+
+
+@pytest.mark.parametrize("after", [2, 3, 5])
+def test_resuming_equals_never_having_stopped(scene, tmp_path, brief, six, after):
+    shutil.copy(six.run / "log.jsonl", tmp_path / "log.jsonl")  # holds a line beyond the checkpoint
+    saved = g.read_checkpoint(six.run / f"after_{after}.pt")
+    assert saved["state"]["step"] == after
+    model, state, _ = run_training(scene, tmp_path, saved=saved)
+    assert state["step"] == 6 and same_weights(six.model, model)
+    assert (tmp_path / "log.jsonl").read_text().count("\n") == 1 and last_log(tmp_path) == last_log(six.run)
+
+
+def test_interrupted_training_saves_and_says_how_to_go_on(scene, tmp_path, brief, monkeypatch):
+    draw, calls = g.random_rays, itertools.count(1)
+
+    def interrupt(*args):
+        if next(calls) == 3:
+            raise KeyboardInterrupt
+        return draw(*args)
+    monkeypatch.setattr(g, "random_rays", interrupt)
+    with pytest.raises(UserError, match="--resume"):
+        run_training(scene, tmp_path)
+    assert g.read_checkpoint(tmp_path / "checkpoint.pt")["state"]["step"] == 2
+
+
+def test_resuming_adds_time_and_dropped_steps_to_those_before(scene, tmp_path, brief, six):
+    saved = g.read_checkpoint(six.run / "after_3.pt")
+    saved["state"].update(seconds=1000.0, dropped=4)
+    shutil.copy(six.run / "log.jsonl", tmp_path)
+    _, state, _ = run_training(scene, tmp_path, saved=saved)
+    assert 1000 < state["seconds"] < 1100 and last_log(tmp_path)["dropped"] == 4
+    assert last_log(tmp_path)["step"] == 6
+
+
+def test_training_never_sees_a_test_photo(scene, tmp_path, brief, monkeypatch):
+    draw, seen = g.make_rays, []
+    monkeypatch.setattr(g, "make_rays", lambda scene, img, pixel: (seen.append(img), draw(scene, img, pixel))[1])
+    run_training(scene, tmp_path, steps=12)
+    assert set(torch.cat(seen).tolist()) == set(torch.nonzero(~scene.is_test)[:, 0].tolist())
+
+
+def test_resuming_adds_energy_to_what_was_spent_before(scene, tmp_path, brief, six, monkeypatch):
+    saved = g.read_checkpoint(six.run / "after_3.pt")
+    saved["state"].update(joules=100.0, sampled_joules=90.0)
+    shutil.copy(six.run / "log.jsonl", tmp_path)
+    monkeypatch.setattr(g, "make_meter", lambda device: g.EnergyMeter("fake", lambda: 5.0, lambda: 0.0, period=1e9))
+    *_, meter = run_training(scene, tmp_path, saved=saved)
+    assert meter.report()["energy_wh"] == pytest.approx(100 / 3600)
+
+
+@pytest.mark.parametrize("before, counter", [(None, lambda: 5.0), (100.0, None)])
+def test_energy_that_was_measured_only_in_part_is_none(scene, tmp_path, brief, six, monkeypatch, before, counter):
+    """A run is resumed on a machine with a counter that it began without, or the other way round."""
+    saved = g.read_checkpoint(six.run / "after_3.pt")
+    saved["state"].update(joules=before, sampled_joules=None)
+    shutil.copy(six.run / "log.jsonl", tmp_path)
+    monkeypatch.setattr(g, "make_meter", lambda device: g.EnergyMeter("fake", counter, period=1e9))
+    *_, meter = run_training(scene, tmp_path, saved=saved)
+    assert meter.report()["energy_wh"] is None
+
+
+@pytest.mark.parametrize("log", [None, '{"step": 1, "loss": 2}\n{"step": 2, "lo'])
+def test_resuming_survives_a_lost_or_torn_log(scene, tmp_path, brief, six, log):
+    if log is not None:
+        (tmp_path / "log.jsonl").write_text(log)
+    run_training(scene, tmp_path, saved=g.read_checkpoint(six.run / "after_3.pt"))
+    assert last_log(tmp_path)["step"] == 6
+
+
+def test_the_octree_of_a_checkpoint_is_restored_with_its_moments(scene, tmp_path, brief):
+    """A refined tree has other rows than a new one; both models then take the same step."""
+    a, b = new_model(scene, levels=3), new_model(scene, levels=3)
+    optimizers = [g.make_optimizer(m) for m in (a, b)]
+
+    def step(model, optimizer, seed):
+        model.losses(*batch(scene, seed=seed), 0.5, generator(seed))[0].backward()
+        optimizer.step()
+        optimizer.zero_grad()
+    step(a, optimizers[0], 0)
+    a.refine(optimizers[0])
+    assert a.sdf.octree.features.shape != b.sdf.octree.features.shape
+    gens = generator(7), generator(8)
+    g.save_checkpoint(tmp_path / "c.pt", a.cfg, a, optimizers[0], gens[0], dict(step=1))
+    assert g.restore(g.read_checkpoint(tmp_path / "c.pt"), tmp_path / "c.pt", b, optimizers[1], gens[1]) == dict(step=1)
+    b.step = a.step
+    assert torch.equal(torch.rand(3, generator=gens[0]), torch.rand(3, generator=gens[1]))
+    for model, optimizer in zip((a, b), optimizers):
+        step(model, optimizer, 1)
+    assert same_weights(a, b) and b.refined == a.refined
+
+
+def fake_clock(monkeypatch, tick=1.0):
+    now = itertools.count()
+    monkeypatch.setattr(g, "time", SimpleNamespace(perf_counter=lambda: next(now) * tick, monotonic=lambda: 0.0))
+
+
+def test_the_budget_in_minutes_ends_training_and_drives_its_schedule(scene, tmp_path, brief, monkeypatch):
+    fake_clock(monkeypatch)
+    seen = []
+    monkeypatch.setattr(g, "set_learning_rate", lambda optimizer, step, progress: seen.append(progress))
+    _, state, _ = run_training(scene, tmp_path, steps=10_000, minutes=0.5)
+    assert state["step"] == len(seen) < 30 and seen == sorted(seen) and 0.8 < seen[-1] <= 1
+
+
+def test_the_curve_costs_neither_time_nor_energy(scene, tmp_path, brief, monkeypatch):
+    fake_clock(monkeypatch)
+    pause = 10_000.0
+    looked, clock = [], g.time.perf_counter
+
+    def look(model, scene, photos, codes):
+        looked.append(1)
+        return codes, 20.0 + len(looked)
+    monkeypatch.setattr(g, "validate", look)
+    g.time.perf_counter = lambda: clock() + pause * len(looked)
+    meter = g.EnergyMeter("fake", lambda: pause * len(looked), period=1e9)
+    monkeypatch.setattr(g, "make_meter", lambda device: meter)
+    _, state, _ = run_training(scene, tmp_path, curve=True, steps=10)
+    assert len(looked) == len(state["curve"]) >= 2 and state["seconds"] < pause and meter.joules == 0
+    assert [p["psnr"] for p in state["curve"]] == [20.0 + i for i in range(1, len(looked) + 1)]
+    seconds = [p["seconds"] for p in state["curve"]]
+    assert seconds == sorted(seconds) and all(b > 4 * 1.5 ** i for i, b in enumerate(seconds))
+
+
+def spoil(monkeypatch, bad, how):
+    """Makes the loss of some steps non-finite."""
+    losses, calls = g.GeoNVS.losses, itertools.count()
+
+    def spoiled(self, *args):
+        total, logs = losses(self, *args)
+        return (how(total, self) if next(calls) in bad else total), logs
+    monkeypatch.setattr(g.GeoNVS, "losses", spoiled)
+
+
+BAD = {"nan loss": lambda total, model: total * math.nan,
+       "infinite loss": lambda total, model: total * math.inf,
+       "infinite gradient": lambda total, model: total + (model.deviation.v - model.deviation.v.detach()).sqrt()}
+
+
+@pytest.mark.parametrize("kind", BAD)
+def test_a_non_finite_step_is_dropped_and_counted_and_reaches_no_weight(scene, tmp_path, brief, monkeypatch, kind):
+    spoil(monkeypatch, range(9), BAD[kind])
+    start = []
+    begin = g.GeoNVS.start
+    monkeypatch.setattr(g.GeoNVS, "start", lambda self, gen: (begin(self, gen), start.append(copy.deepcopy(self))))
+    model, _, _ = run_training(scene, tmp_path, steps=3)
+    assert all(torch.equal(a, b) for a, b in zip(model.parameters(), start[0].parameters()))
+    assert last_log(tmp_path)["dropped"] == 3
+    assert g.read_checkpoint(tmp_path / "checkpoint.pt")["state"]["dropped"] == 3
+
+
+def test_training_goes_on_after_a_dropped_step(scene, tmp_path, brief, monkeypatch):
+    spoil(monkeypatch, {1}, BAD["nan loss"])
+    model, _, _ = run_training(scene, tmp_path, steps=4)
+    assert last_log(tmp_path)["dropped"] == 1
+    assert all(torch.isfinite(p).all() for p in model.parameters()) and math.isfinite(last_log(tmp_path)["rgb"])
+
+
+def damage(kind, good, path):
+    if kind == "missing":
+        return
+    data = good.read_bytes()
+    if kind == "truncated":
+        path.write_bytes(data[:len(data) // 2])
+    elif kind == "empty":
+        path.write_bytes(b"")
+    elif kind == "text":
+        path.write_text("not a checkpoint\n")
+    elif kind == "foreign":
+        torch.save({"weights": torch.zeros(3)}, path)
+    elif kind == "a tensor":
+        torch.save(torch.zeros(3), path)
+    elif kind == "code":
+        torch.save(dict(geonvs=1, run=Path), path)  # a class: not data
+
+
+@pytest.mark.parametrize("kind", ["missing", "truncated", "empty", "text", "foreign", "a tensor", "code"])
+def test_a_bad_checkpoint_is_refused_in_one_sentence(six, tmp_path, kind):
+    damage(kind, six.run / "checkpoint.pt", tmp_path / "checkpoint.pt")
+    with pytest.raises(UserError) as error:
+        g.read_checkpoint(tmp_path / "checkpoint.pt")
+    assert "checkpoint.pt" in str(error.value) and "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("changes", [dict(hidden=8), dict(levels=3), dict(background="off"), dict(appearance="off")])
+def test_a_checkpoint_of_other_settings_is_refused(scene, tmp_path, brief, six, changes):
+    with pytest.raises(UserError, match="does not fit"):
+        run_training(scene, tmp_path, saved=g.read_checkpoint(six.run / "checkpoint.pt"), **changes)
+
+
+def test_learning_rate_warms_up_linearly_and_falls_to_five_percent():
+    optimizer = SimpleNamespace(param_groups=[dict(base_lr=2.0, lr=0.0)])
+
+    def rate(step, progress):
+        g.set_learning_rate(optimizer, step, progress)
+        return optimizer.param_groups[0]["lr"]
+    assert rate(0, 0) == pytest.approx(0.02) and rate(49, 0) == pytest.approx(1.0)
+    assert rate(99, 0) == rate(500, 0) == pytest.approx(2.0)
+    assert rate(500, 0.5) == pytest.approx(2 * (0.05 + 0.95 / 2)) and rate(999, 1.0) == pytest.approx(0.1)
+
+
+# ---- 11 scoring, mesh, pictures ------------------------------------------------------------------------
+
+def picture(*shape, seed=0):
+    return np.random.default_rng(seed).integers(0, 256, shape).astype(np.uint8)
+
+
+@pytest.mark.parametrize("offset", [1, 5, 100])
+def test_psnr_of_a_constant_offset(offset):
+    a = picture(9, 7, 3) // 2
+    assert g.psnr(a, a + np.uint8(offset)) == pytest.approx(20 * math.log10(255 / offset))
+    assert g.psnr(a + np.uint8(offset), a) == g.psnr(a, a + np.uint8(offset))
+    assert g.psnr(a, a) == pytest.approx(100)  # its cap
+
+
+def naive_ssim(a, b):
+    """SSIM over all complete windows of 11 px with Gaussian weights of sigma 1.5, in float64."""
+    k = np.exp(-np.arange(-5, 6) ** 2 / (2 * 1.5 ** 2))
+    window = np.outer(k, k) / k.sum() ** 2
+    total = []
+    for c in range(3):
+        for i, j in itertools.product(range(a.shape[0] - 10), range(a.shape[1] - 10)):
+            x, y = (p[i:i + 11, j:j + 11, c].astype(float) for p in (a, b))
+            mx, my = (window * x).sum(), (window * y).sum()
+            vx, vy, vxy = (window * x * x).sum() - mx * mx, (window * y * y).sum() - my * my, (window * x * y).sum() - mx * my
+            c1, c2 = (0.01 * 255) ** 2, (0.03 * 255) ** 2
+            total.append((2 * mx * my + c1) * (2 * vxy + c2) / ((mx ** 2 + my ** 2 + c1) * (vx + vy + c2)))
+    return np.mean(total)
+
+
+def test_ssim_equals_a_naive_loop_is_one_for_equal_pictures_and_none_for_tiny_ones():
+    a = picture(14, 16, 3)
+    b = np.clip(a * 0.7 + picture(14, 16, 3, seed=1) * 0.3, 0, 255).astype(np.uint8)
+    assert g.ssim(a, b) == pytest.approx(naive_ssim(a, b), rel=1e-6)
+    assert g.ssim(a, a) == pytest.approx(1) and g.ssim(a[:10], b[:10]) is None
+
+
+def fake_lpips():
+    torch.manual_seed(0)
+    trunk, heads = {}, {}
+    sizes = (3, 64, 11), (64, 192, 5), (192, 384, 3), (384, 256, 3), (256, 256, 3)
+    for i, (index, (a, b, k)) in enumerate(zip((0, 3, 6, 8, 10), sizes)):
+        trunk[f"features.{index}.weight"] = torch.randn(b, a, k, k) * (2 / (a * k * k)) ** 0.5
+        trunk[f"features.{index}.bias"] = torch.randn(b) * 0.1
+        heads[f"lin{i}.model.1.weight"] = torch.rand(1, b, 1, 1)
+    return g.LPIPS().load(trunk, heads), trunk, heads
+
+
+def test_lpips_is_zero_for_equal_pictures_symmetric_and_grows_with_the_difference():
+    net, *_ = fake_lpips()
+    a, b = random(2, 1, 3, 64, 64, dtype=torch.float32)
+    d = [net(a, a + k * (b - a)).item() for k in (0, 0.2, 1)]
+    assert d[0] == 0 and 0 < d[1] < d[2]
+    assert net(b, a).item() == pytest.approx(d[2], rel=1e-5)
+
+
+def test_lpips_equals_a_naive_alexnet():
+    net, trunk, heads = fake_lpips()
+    a, b = random(2, 1, 3, 64, 64, dtype=torch.float32)
+    mean, std = torch.tensor([-0.030, -0.088, -0.188]), torch.tensor([0.458, 0.448, 0.450])
+    x, want = [((2 * p - 1) - mean[:, None, None]) / std[:, None, None] for p in (a, b)], 0.0
+    for i, (index, stride, pad) in enumerate(((0, 4, 2), (3, 1, 2), (6, 1, 1), (8, 1, 1), (10, 1, 1))):
+        if index in (3, 6):
+            x = [F.max_pool2d(p, 3, 2) for p in x]
+        x = [F.relu(F.conv2d(p, trunk[f"features.{index}.weight"], trunk[f"features.{index}.bias"], stride, pad))
+             for p in x]
+        unit = [p / (p.norm(dim=1, keepdim=True) + 1e-10) for p in x]
+        want += (heads[f"lin{i}.model.1.weight"] * (unit[0] - unit[1]) ** 2).sum(1).mean().item()
+    assert net(a, b).item() == pytest.approx(want, rel=1e-4)
+
+
+def test_lpips_without_its_weights_is_none_with_one_line_of_reason(capsys):
+    assert g.make_lpips("cpu") is None
+    assert capsys.readouterr().out.count("\n") == 1
+
+
+def test_half_pixels_are_disjoint_and_complete(odd):
+    for photo, (w, h) in enumerate(odd.wh.tolist()):
+        left, right = (g.half_pixels(odd, photo, side).tolist() for side in (True, False))
+        assert sorted(left + right) == list(range(w * h)) and {p % w for p in left} == set(range(w // 2))
+
+
+def test_floor_picture_is_the_mean_colour_of_each_row_of_the_left_half():
+    truth = random(4, 7, 3).numpy()
+    want = [[[round(255 * sum(truth[i, j, c] for j in range(3)) / 3) for c in range(3)]] for i in range(4)]
+    assert g.floor_picture(truth).tolist() == want
+
+
+def test_to_uint8_rounds_and_clips():
+    assert g.to_uint8(np.array([-1, 0, 0.4999 / 255, 0.5001 / 255, 1, 2])).tolist() == [0, 0, 0, 1, 255, 255]
+
+
+def with_pixels(scene, left, value):
+    """The scene with one half of every test photo painted over."""
+    rgb = scene.rgb.clone()
+    for photo in torch.nonzero(scene.is_test)[:, 0].tolist():
+        rgb[scene.start[photo] + g.half_pixels(scene, photo, left)] = value
+    return scene._replace(rgb=rgb)
+
+
+@pytest.mark.parametrize("protocol, blind", [("half", True), ("leaky", False)])
+def test_fitting_a_code_never_sees_the_right_half_unless_the_protocol_leaks(warm, scene, protocol, blind):
+    photos = torch.nonzero(scene.is_test)[:, 0]
+    before = copy.deepcopy(weights(warm))
+    a, b, c = (g.fit_codes(warm, s, photos, None, 2, protocol, 16)
+               for s in (scene, with_pixels(scene, False, 255), with_pixels(scene, True, 255)))
+    assert torch.equal(a, b) is blind and not torch.equal(a, c)
+    assert all(torch.equal(v, before[k]) for k, v in weights(warm).items())
+    assert all(p.requires_grad and p.grad is None for p in warm.parameters())
+
+
+def test_fitting_codes_starts_from_the_mean_code_of_training_photos(warm, scene):
+    photos = torch.nonzero(scene.is_test)[:, 0]
+    want = warm.codes()[~scene.is_test].mean(0).expand(len(photos), -1)
+    close(g.fit_codes(warm, scene, photos, None, 0, "half"), want.detach())
+
+
+def test_fitting_codes_lowers_the_error(warm, scene):
+    photos = torch.nonzero(scene.is_test)[:, 0]
+    dark = with_pixels(scene, True, 0)  # a code can at least darken the picture
+
+    def brightness(codes):
+        rays = g.make_rays(dark, photos.repeat_interleave(60), torch.arange(120) % 60 * 11)
+        return warm.render(rays, codes.repeat_interleave(60, 0))["rgb"].mean().item()
+    start, end = (g.fit_codes(warm, dark, photos, None, n, "half", 32) for n in (0, 20))
+    assert brightness(end) < brightness(start)
+
+
+def test_fitting_goes_on_from_given_codes(warm, scene):
+    photos = torch.nonzero(scene.is_test)[:, 0]
+    given = torch.full((len(photos), 4), 0.3)
+    assert torch.equal(g.fit_codes(warm, scene, photos, given, 0, "half"), given)
+
+
+def test_validation_sees_left_halves_only(warm, scene):
+    photos = torch.nonzero(scene.is_test)[:, 0]
+    values = [g.validate(warm, s, photos, torch.zeros(len(photos), 4))[1]
+              for s in (scene, with_pixels(scene, False, 255), with_pixels(scene, True, 255))]
+    assert values[0] == values[1] != values[2] and math.isfinite(values[0])
+
+
+class Perfect(nn.Module):
+    """A model that renders the right halves of photos perfectly, and the left halves black."""
+
+    use_mask = True
+
+    def __init__(self, scene):
+        super().__init__()
+        self.cfg, self.appearance = config(), nn.Embedding(len(scene.wh), 2)
+        self.raw = scene.raw
+
+    def sdf(self, x):
+        world = x.double().numpy() * self.raw["scale"] + self.raw["center"]
+        return torch.as_tensor(data_prep.toy_sdf(world) / self.raw["scale"]), None
+
+    def render(self, rays, code):
+        return dict(rgb=rays.rgb * (rays.uv[:, :1] > 0.499) + 0 * code.sum(), depth=rays.near)
+
+    def codes(self):
+        return self.appearance.weight
+
+    def mask_of(self, rays, pick):
+        w, h = self.raw["wh"][int(pick)]
+        pixel = (rays.uv[:, 1] * h).long() * w + (rays.uv[:, 0] * w).long()
+        return torch.as_tensor(self.raw["occluder"][self.raw["start"][int(pick)]:][pixel.numpy()]).float()
+
+
+def test_only_the_right_half_is_scored(scene):
+    scores = g.evaluate(Perfect(scene), scene, config(), None)
+    assert scores["psnr"] == pytest.approx(100) and scores["ssim"] == pytest.approx(1) and scores["lpips"] is None
+    assert len(scores["per_image"]) == 2 and 5 < scores["psnr_floor"] < 40
+    assert scores["psnr_floor"] == pytest.approx(np.mean([row["psnr_floor"] for row in scores["per_image"]]))
+
+
+def test_scoring_without_test_photos_gives_none(scene):
+    scores = g.evaluate(Perfect(scene), scene._replace(is_test=torch.zeros_like(scene.is_test)), config(), None)
+    assert scores["psnr"] is None and scores["per_image"] == []
+
+
+def test_truth_of_the_toy_is_matched_by_a_perfect_model(scene):
+    found = g.toy_truth(Perfect(scene), scene)
+    assert found["sdf_error"] < 1e-6 and found["mask_iou"] == 1 and found["mask_static"] == 0
+
+
+def test_a_mask_over_everything_is_right_only_where_something_passes_by(scene):
+    model = Perfect(scene)
+    model.mask_of = lambda rays, pick: torch.ones(len(rays.o))
+    photos = [scene.raw["occluder"][a:b] for a, b, test in zip(
+        scene.raw["start"], scene.raw["start"][1:], scene.raw["is_test"]) if not test]
+    found = g.toy_truth(model, scene)
+    assert found["mask_iou"] == pytest.approx(np.concatenate(photos).mean()) and found["mask_static"] == 1
+    model.use_mask = False
+    assert g.toy_truth(model, scene)["mask_iou"] is None
+
+
+def test_sdf_error_of_a_shifted_surface_is_the_shift(scene):
+    model = Perfect(scene)
+    model.sdf = lambda x: (Perfect.sdf(model, x)[0] + 0.01, None)
+    assert g.toy_truth(model, scene)["sdf_error"] == pytest.approx(0.01, rel=1e-3)
+
+
+def test_rendering_a_photo_keeps_its_shape_and_pixel_order_whatever_the_chunk(warm, scene, monkeypatch):
+    for photo in (0, 1):
+        whole = g.render_photo(warm, scene, photo, warm.appearance.weight[photo])
+        w, h = scene.wh[photo].tolist()
+        assert whole["rgb"].shape == (h, w, 3) and whole["mask"].shape == whole["depth"].shape == (h, w)
+        assert np.array_equal(g.to_uint8(whole["truth"][3, 5]), pixel_of(scene, photo, 5, 3))
+    monkeypatch.setattr(g, "CHUNK", 100)
+    close(g.render_photo(warm, scene, 1, warm.appearance.weight[1])["rgb"], whole["rgb"], atol=1e-4)
+
+
+@pytest.fixture(scope="session")
+def mesh(warm):
+    return g.extract_mesh(warm, 48)
+
+
+def test_mesh_of_the_warm_up_sphere_is_that_sphere_in_sfm_units(warm, scene, mesh):
+    vertices, faces, colors = mesh
+    r = np.linalg.norm((vertices - scene.raw["center"]) / scene.raw["scale"], axis=1)
+    assert len(faces) > 1000 and colors.shape == vertices.shape and colors.dtype == np.uint8
+    assert abs(r.mean() - 0.5) < 0.02 and np.abs(r - 0.5).max() < 0.08
+
+
+def test_mesh_is_closed_and_its_faces_look_outwards(scene, mesh):
+    vertices, faces, _ = mesh
+    a, b, c = (vertices[faces[:, i]] - scene.raw["center"] for i in range(3))
+    volume = (np.cross(a, b) * c).sum() / 6 / scene.raw["scale"] ** 3
+    assert volume == pytest.approx(4 / 3 * math.pi * 0.5 ** 3, rel=0.1)
+    directed = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    forth, back = (set(map(tuple, e.tolist())) for e in (directed, directed[:, ::-1]))
+    assert len(forth) == len(directed) and forth == back  # each edge once in each direction
+
+
+def test_mesh_of_an_empty_scene_is_empty(warm):
+    model = copy.deepcopy(warm)
+    with torch.no_grad():
+        model.sdf.lin2.weight.zero_()
+        model.sdf.lin2.bias.fill_(0.4)
+    model.refresh_cache(0, 1)
+    assert [len(part) for part in g.extract_mesh(model, 16)] == [0, 0, 0]
+
+
+def read_ply(path):
+    data = path.read_bytes()
+    head, body = data.split(b"end_header\n", 1)
+    nv, nf = (int(re.search(rb"element %s (\d+)" % k, head)[1]) for k in (b"vertex", b"face"))
+    v = np.frombuffer(body, [("xyz", "<f4", 3), ("rgb", "u1", 3)], nv)
+    f = np.frombuffer(body, [("n", "u1"), ("index", "<i4", 3)], nf, offset=nv * 15)
+    assert head.startswith(b"ply\nformat binary_little_endian 1.0\n") and len(body) == nv * 15 + nf * 13
+    return v["xyz"].copy(), f["index"], v["rgb"], f["n"]
+
+
+def test_ply_reads_back_as_written(tmp_path, mesh):
+    g.write_ply(tmp_path / "mesh.ply", *mesh)
+    vertices, faces, colors, n = read_ply(tmp_path / "mesh.ply")
+    close(vertices, mesh[0], rtol=1e-6)
+    assert np.array_equal(faces, mesh[1]) and np.array_equal(colors, mesh[2]) and (n == 3).all()
+
+
+def test_png_reads_back_as_written_in_rgb(tmp_path):
+    a = picture(5, 8, 3)
+    g.write_png(tmp_path / "a.png", a)
+    assert np.array_equal(g.cv2.imread(str(tmp_path / "a.png"))[:, :, ::-1], a)
+
+
+def test_colormap_is_monotone_in_brightness_and_survives_a_flat_picture():
+    grey = g.colormap(np.linspace(0, 1, 64)[None], 0, 1).astype(float).mean(2)[0]
+    assert grey[-1] > grey[32] > grey[0]
+    assert np.isfinite(g.colormap(np.ones((2, 2)), 1, 1)).all()
+
+
+def test_camera_path_starts_and_ends_at_cameras_with_rotations_all_along(scene):
+    c2w = scene.c2w[~scene.is_test]
+    path = g.camera_path(c2w, 50)
+    turn = path[:, :, :3]
+    close(turn @ turn.transpose(1, 2), torch.eye(3).expand(50, 3, 3), atol=1e-4)
+    assert (torch.linalg.det(turn) > 0).all()
+    for end in (path[0], path[-1]):
+        assert (c2w - end).abs().amax((1, 2)).min() < 1e-3
+    assert (path[1:, :, 3] - path[:-1, :, 3]).norm(dim=1).max() < (path[0, :, 3] - path[-1, :, 3]).norm()
+
+
+@pytest.mark.parametrize("kind", ["orbit", "appearance"])
+def test_films_have_their_frames(warm, scene, tmp_path, kind):
+    g.film(warm, scene, kind, tmp_path / "a.mp4", count=3)
+    video, frames = g.cv2.VideoCapture(str(tmp_path / "a.mp4")), 0
+    while video.read()[0]:
+        frames += 1
+    assert frames == 3
+
+
+# ---- 12 experiments ------------------------------------------------------------------------------------
+
+def test_ablation_rows_change_settings_that_exist():
+    assert all(set(change) <= {f.name for f in dataclasses.fields(g.Config)} for change in g.ABLATION.values())
+    assert g.ABLATION["full"] == {}
+    assert all(change[k] != getattr(g.Config(), k) for change in g.ABLATION.values() for k in change)
+
+
+def test_a_level_is_reached_where_the_curve_crosses_it():
+    curve = [dict(psnr=10.0, seconds=1.0, wh=None), dict(psnr=20.0, seconds=100.0, wh=None)]
+    assert g.reached(curve, 15, "seconds") == pytest.approx(10)  # half way in log time
+    assert g.reached(curve, 5, "seconds") == 1 and g.reached(curve, 20, "seconds") == pytest.approx(100)
+    assert g.reached(curve, 21, "seconds") is None and g.reached(curve, 15, "wh") is None
+
+
+def test_summary_is_mean_and_spread_and_none_when_nothing_was_measured():
+    rows = [dict(a=1.0, b=None), dict(a=3.0, b=None)]
+    assert g.summary(rows, "a") == (2.0, 1.0) and g.summary(rows, "b") == (None, None) == g.summary(rows, "c")
+
+
+def test_table_leaves_cells_empty_that_were_not_measured(tmp_path):
+    g.write_table(tmp_path / "a.csv", [dict(x=1.23456789, y=None, z="n"), dict(x=2, y=3.0, z="m")])
+    assert (tmp_path / "a.csv").read_text() == "x,y,z\n1.2346,,n\n2,3,m\n"
+
+
+def finished(folder, **metrics):
+    """A run folder as training leaves it."""
+    folder.mkdir(parents=True)
+    curve = [dict(step=i, seconds=2.0 ** i, psnr=15.0 + i, wh=None) for i in range(3)]
+    base = dict(scene="toy", device="cpu", curve=curve, psnr_floor=14.0, psnr=18.0, energy_wh=None)
+    (folder / "metrics.json").write_text(json.dumps(base | metrics))
+    return str(folder)
+
+
+def test_chart_of_finished_runs_writes_picture_and_table(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    runs = [finished(tmp_path / name, method=method, psnr=value)
+            for name, method, value in (("a", "geonvsw", 20.0), ("b", "geonvsw", 22.0), ("c", "nerfw", 17.0))]
+    g.main(["--chart", *runs])
+    head, *rows = [line.split(",") for line in (tmp_path / "chart.csv").read_text().splitlines()]
+    table = {row[0]: dict(zip(head, row)) for row in rows}
+    assert list(table) == ["geonvsw", "nerfw"] and table["geonvsw"]["runs"] == "2"
+    assert float(table["geonvsw"]["psnr"]) == 21 and float(table["geonvsw"]["psnr_std"]) == 1
+    assert table["nerfw"]["energy_wh"] == "" and float(table["nerfw"]["seconds_to_16dB"]) == pytest.approx(2)
+    assert table["nerfw"]["seconds_to_25dB"] == "" and (tmp_path / "chart.png").stat().st_size > 1000
+
+
+def test_chart_without_matplotlib_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    with pytest.raises(UserError, match="pip install matplotlib"):
+        g.chart({}, ["somewhere"], 1)
+
+
+def test_a_finished_run_of_a_matrix_is_read_and_not_repeated(tmp_path):
+    run = Path(finished(tmp_path / "a", method="geonvsw", psnr=12.5))
+    assert g.run_once(dict(steps=1), run)["psnr"] == 12.5
+
+
+# ---- 13 command line -----------------------------------------------------------------------------------
+
+FLAGS = [f"--{k}={v}" for k, v in TINY.items()]
+METRICS = """scene method seed steps device psnr psnr_floor ssim lpips per_image train_seconds energy_wh energy_source
+    rays_per_second parameters octree_cells model_bytes protocol torch commit sdf_error mask_iou""".split()
+
+
+@pytest.fixture
+def desk(tmp_path, monkeypatch, arrays, brief):
+    """An empty working folder with the tiny toy scene in it."""
+    monkeypatch.chdir(tmp_path)
+    data_prep.write_scene(tmp_path / "data" / "toy.npz", arrays)
+    return tmp_path
+
+
+def command(*argv):
+    """Exit code of a command line."""
+    try:
+        g.run_command_line(lambda: g.main(list(argv)))
+    except SystemExit as end:
+        return end.code
+    return 0
+
+
+def metrics_of(desk, name):
+    return json.loads((desk / "runs" / name / "metrics.json").read_text())
+
+
+def test_one_command_trains_scores_and_writes_everything(desk, capsys):
+    assert command(*FLAGS, "--name", "a", "--seed", "3") == 0
+    run, metrics = desk / "runs" / "a", metrics_of(desk, "a")
+    assert {p.name for p in run.iterdir()} == {"metrics.json", "log.jsonl", "checkpoint.pt", "panel.png", "mesh.ply"}
+    assert not [k for k in METRICS if k not in metrics]
+    assert metrics["seed"] == 3 and metrics["steps"] == 6 and metrics["scene"] == "toy" and metrics["lpips"] is None
+    assert metrics["energy_wh"] is None or metrics["energy_wh"] > 0
+    assert metrics["rays_per_second"] == pytest.approx(6 * 64 / metrics["train_seconds"])
+    assert metrics["config"]["seed"] == 3 and "left half" in metrics["protocol"]
+    assert "lpips is null" in capsys.readouterr().out
+    assert [json.loads(line)["step"] for line in (run / "log.jsonl").read_text().splitlines()][-1] == 6
+    assert command("--resume", "--name", "a", "--steps", "8") == 0  # goes on with the run's own settings
+    metrics = metrics_of(desk, "a")
+    assert metrics["steps"] == 8 and metrics["config"]["hidden"] == 16 and metrics["config"]["seed"] == 3
+
+
+@pytest.mark.parametrize("method", ["nerfw", "hanerf"])
+def test_baselines_run_by_the_same_command(desk, method):
+    more = dict(rays=1024, photos=1, samples=4, hidden=16, steps=2, method=method, name="a", protocol="leaky")
+    assert command(*FLAGS, *(f"--{k}={v}" for k, v in more.items())) == 0
+    metrics = metrics_of(desk, "a")
+    assert "leaky" in metrics["protocol"]  # and says so
+    assert metrics["method"] == method and metrics["psnr"] > 0 and metrics["sdf_error"] is None
+    assert metrics["octree_cells"] is None and not (desk / "runs" / "a" / "mesh.ply").exists()
+
+
+BAD_COMMANDS = {
+    "misspelt flag": (["--stepz", "3"], "--steps"),
+    "abbreviated flag": (["--sam", "3"], "--sam"),
+    "unknown scene": (["--scene", "brandenbrug"], "brandenburg"),
+    "scene not there yet": (["--scene", "sacre"], "data_prep.py"),
+    "no such folder": (["--data", "nowhere"], "nowhere"),
+    "no GPU": (["--device", "cuda"], "cpu"),
+    "unknown device": (["--device", "potato"], "potato"),
+    "a device without numbers": (["--device", "meta"], "meta"),
+    "unknown method": (["--method", "nerv"], "nerv"),
+    "word for a number": (["--steps", "many"], "many"),
+    "negative weight": (["--lam_gpl", "-1"], "lam_gpl"),
+    "weight that is no number": (["--lr_grid", "nan"], "lr_grid"),
+    "too few samples": (["--samples", "1"], "samples"),
+    "no rays": (["--rays", "0"], "rays"),
+    "one ray": (["--rays", "1", "--photos", "1"], "rays"),
+    "more levels than corner keys can tell apart": (["--levels", "12"], "levels"),
+    "a seed too long for a generator": (["--seed", "9" * 30], "seed"),
+    "no background levels": (["--bg_levels", "0"], "bg_levels"),
+    "no pixels for the mask": (["--mask_px", "1"], "mask_px"),
+    "rays that do not divide": (["--rays", "10", "--photos", "3"], "photos"),
+    "a grid of rays too small for Ha-NeRF": (["--method", "hanerf", "--rays", "16"], "rays"),
+    "nothing to resume": (["--resume"], "--resume"),
+    "nothing to film": (["--render", "orbit"], "checkpoint"),
+    "nothing to chart": (["--chart", "nowhere"], "nowhere"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_COMMANDS)
+def test_a_mistake_ends_with_code_2_and_one_line_that_helps(desk, capsys, monkeypatch, case):
+    argv, word = BAD_COMMANDS[case]
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert command(*FLAGS, "--steps=1", *argv) == 2
+    err = capsys.readouterr().err
+    assert err.startswith("error: ") and err.count("\n") == 1 and word in err and not (desk / "runs").exists()
+
+
+@pytest.mark.parametrize("saved", [dict(geonvs=1), dict(geonvs=1, config=dict(flux=88))])
+def test_a_checkpoint_of_another_version_is_refused_in_one_line(desk, capsys, saved):
+    (desk / "runs" / "a").mkdir(parents=True)
+    torch.save(saved, desk / "runs" / "a" / "checkpoint.pt")
+    assert command("--resume", "--name", "a") == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_two_folders_of_one_name_are_two_scenes(desk, monkeypatch, arrays):
+    made = []
+    monkeypatch.setattr(data_prep, "prepare", lambda folder, *more: (made.append(str(folder)), arrays)[1])
+    for folder in ("one/photos", "two/photos", "two/photos"):
+        (desk / folder).mkdir(parents=True, exist_ok=True)
+        g.find_scene(config(data=folder, downscale=1))
+    assert made == ["one/photos", "two/photos"]
+
+
+def test_a_baseline_of_a_scene_without_points_ends_in_words_or_works(scene):
+    model = baseline(scene._replace(points=scene.points[:0]), "nerfw")
+    assert math.isfinite(model.far)
+
+
+@pytest.mark.parametrize("name", [f.name for f in dataclasses.fields(g.Config)])
+def test_every_setting_is_a_flag_with_help_and_is_used(name):
+    text = re.sub(r"\s+", " ", g.make_parser().format_help())
+    assert re.search(rf"--{name}\b", text)
+    assert re.search(rf"\bcfg\.{name}\b", Path(g.__file__).read_text())
+
+
+def test_settings_of_scenes_and_methods_are_settings_and_flags_overrule_them():
+    names = {f.name for f in dataclasses.fields(g.Config)}
+    more = [*g.SCENES.values(), *(settings for _, settings in g.METHODS.values())]
+    assert all(set(m) <= names for m in more) and set(data_prep.SCENES) < set(g.SCENES)
+    assert g.make_config(dict(scene="sacre")).steps == g.SCENES["sacre"]["steps"]
+    assert g.make_config(dict(scene="sacre", method="nerfw")).rays == g.METHODS["nerfw"][1]["rays"]
+    assert g.make_config(dict(scene="sacre", method="nerfw", steps=9, rays=7)).rays == 7
+
+
+@pytest.mark.parametrize("given", [dict(scene=s, method=m) for s in g.SCENES for m in g.METHODS])
+def test_every_scene_and_method_has_settings_that_pass_the_check(given):
+    g.check(g.make_config(given))
+
+
+def test_deviations_listed_in_the_docstring_are_those_tagged_in_the_code():
+    code = Path(g.__file__).read_text().replace(g.__doc__, "")
+    listed = re.findall(r"^  \[(D\d+)\]", g.__doc__, re.M)
+    assert len(listed) == len(set(listed)) and set(listed) == set(re.findall(r"\[(D\d+)\]", code))
