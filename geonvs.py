@@ -45,6 +45,7 @@ import json
 import math
 import os
 import platform
+import signal
 import subprocess
 import sys
 import threading
@@ -377,15 +378,15 @@ class Octree(nn.Module):
 
 
 def seed_octree(octree: Octree, points: Tensor, dense: int, shell: tuple[float, float]) -> None:
-    """Splits all cells that touch the shell of radii up to level `dense`; below, those near points:
-    one cell on every side, so that the corners around a point are never hanging."""
+    """Splits all cells that touch the shell of radii up to level `dense`, then two levels of cells
+    near points: one cell on every side, so that the corners around a point are never hanging."""
     for level in range(octree.levels - 1):
         if level < dense:
             reach = octree.cell(level) * math.sqrt(3) / 2
             r = octree.centres(level).norm(dim=1)  # (N,)
             touches = (r > shell[0] - reach) & (r < shell[1] + reach)  # (N,)
             octree.split(level, octree.cells[level][touches])
-        elif len(points):
+        elif len(points) and level < dense + 2:
             octree.split(level, octree.around(octree.cell_of(points, level), level))
     octree.features.data[1:].normal_(0, octree.std)
 
@@ -802,8 +803,9 @@ class GeoNVS(Method):
         return [dict(params=grids, lr=self.cfg.lr_grid), dict(params=nets, lr=self.cfg.lr_net),
                 dict(params=[zeta], lr=self.cfg.lr_zeta)]
 
-    def start(self, gen: torch.Generator, steps: int = 200, radius: float = 0.5) -> None:
-        """Warm-up: L_sphere fits the SDF to a sphere, from where every surface can be reached."""
+    def start(self, gen: torch.Generator, steps: int = 200, radius: float = 0.25) -> None:
+        """Warm-up: L_sphere fits the SDF to a sphere. A small one: a surface that starts inside the
+        landmark grows to it, one that starts outside also has to be carved out of the sky."""
         nets = [*self.sdf.lin1.parameters(), *self.sdf.lin2.parameters()]
         grid = dict(params=[self.sdf.octree.features], lr=1e-3)
         adam = torch.optim.Adam([grid, dict(params=nets, lr=5e-3)])
@@ -896,7 +898,7 @@ class GeoNVS(Method):
     def refine(self, optimizer: torch.optim.Optimizer) -> None:
         """Fits the octree to the scene: no fine cell far from the surface or where pictures agree.
         A cell of level >= 1 stays split while the surface is within a cell of it; worst cells there
-        are newly split, up to cfg.max_mb. Adam's moments move with their features."""
+        are newly split, coarse levels first, up to cfg.max_mb. Adam's moments move along."""
         octree, keys = self.sdf.octree, list(self.sdf.octree.split_keys)
         hits = self.hits[self.hits[:, 0] < 2]  # (P,4) without the slots that no ray has filled
         for level in range(1, octree.levels - 1):
@@ -906,6 +908,7 @@ class GeoNVS(Method):
             worst = worst_cells(octree, level, hits, self.cfg.split_error)  # (Q,3)
             new = octree.key(worst, level)
             new = new[torch.isin(new, close) & ~torch.isin(new, keys[level])]
+            new = new if level <= 2 * self.refined + 1 else new[:0]
             room = int(max(0, self.cfg.max_mb * 2 ** 20 - octree.bytes()) // SPLIT_BYTES)
             keys[level] = torch.cat([keys[level][torch.isin(keys[level], close)], new[:room]])
         old = octree.features
@@ -1309,8 +1312,12 @@ def train(cfg: Config, scene: Scene, run: Path, saved: dict | None = None):
     def save():
         state.update(joules=meter.joules, sampled_joules=meter.sampled_joules, dropped=int(dropped))
         save_checkpoint(checkpoint, cfg, model, optimizer, gen, state | dict(seconds=clock()))
+    stop = threading.Event()  # Ctrl-C lets a step end, so that what is saved is whole
+    handler = signal.signal(signal.SIGINT, lambda *_: stop.set())
     try:
-        while state["step"] < cfg.steps and not (cfg.minutes and clock() >= 60 * cfg.minutes):
+        while state["step"] < cfg.steps and not stop.is_set():
+            if cfg.minutes and clock() >= 60 * cfg.minutes:
+                break
             spent = clock() / (60 * cfg.minutes) if cfg.minutes else 0
             progress = max(state["step"] / cfg.steps, spent)
             logs, is_dropped = training_step(model, optimizer, photos, state, progress, gen)
@@ -1329,12 +1336,12 @@ def train(cfg: Config, scene: Scene, run: Path, saved: dict | None = None):
             if time.perf_counter() - last_save > CHECKPOINT_S:
                 save()
                 last_save = time.perf_counter()
-    except KeyboardInterrupt:
+    finally:
+        signal.signal(signal.SIGINT, handler)
         meter.stop()
-        save()
-        raise UserError(f"stopped at step {state['step']}; add --resume to go on") from None
-    meter.stop()
     save()
+    if stop.is_set():
+        raise UserError(f"stopped at step {state['step']}; add --resume to go on")
     state["seconds"] = clock()
     return model, state, meter
 
