@@ -988,7 +988,7 @@ def warm(scene):
     torch.manual_seed(0)
     gen = generator()
     model = g.GeoNVS(config(), scene, gen)
-    model.start(gen)
+    model.start(gen, radius=0.5)
     model.zero_grad()
     return model
 
@@ -2447,7 +2447,7 @@ class Refinable(SimpleNamespace):
 def refinable(levels=4, **changes):
     octree = g.Octree(1.0, levels, 2, root=8)
     g.seed_octree(octree, torch.zeros(0, 3), 2, (0.0, 0.9))  # levels 0 and 1 split everywhere
-    model = Refinable(cfg=config(**changes), sdf=Ball(), hits=torch.full((64, 4), 2.0))
+    model = Refinable(cfg=config(**changes), sdf=Ball(), hits=torch.full((64, 4), 2.0), refined=4)
     model.sdf.octree = octree
     model.optimizer = torch.optim.Adam([dict(params=[octree.features], lr=0.01)])
     octree.features[1:].sum().backward()
@@ -2455,6 +2455,17 @@ def refinable(levels=4, **changes):
     state = model.optimizer.state[octree.features]
     state["exp_avg"][:, 0] = octree.row_key.float()  # a mark by which to know each row again
     return model
+
+
+@pytest.mark.parametrize("refined", [0, 1])
+def test_refining_goes_from_coarse_to_fine(refined):
+    model = refinable(levels=6, split_error=0.1)
+    octree = model.sdf.octree
+    for model.refined in range(refined + 1):
+        hit_the_ball(model, 64, 0.5)
+        g.GeoNVS.refine(model, model.optimizer)
+        deepest = max(level for level, keys in enumerate(octree.split_keys) if len(keys))
+        assert deepest <= max(2 * model.refined + 1, 1) and deepest > 2 * model.refined - 1
 
 
 def hit_the_ball(model, n, error, direction=(0.3, -0.5, 0.8)):
