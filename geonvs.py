@@ -370,7 +370,7 @@ class Octree(nn.Module):
         basis = torch.stack([torch.ones_like(fx), fz, fy, yz, fx, fx * fz, fx * fy, fx * yz], 1)
         w = basis @ TRILINEAR[:, :8 * J].to(x.device)  # (PL,8) to (PL,8J)
         out = Interpolate.apply(self.features, corner.reshape(-1, 8), w.reshape(-1, J, 8))
-        return out.reshape(P, L, J, -1)
+        return out.reshape(P, L, J, self.features.shape[1])
 
     def bytes(self) -> int:
         """Memory of features and of the structure that a query needs."""
@@ -426,7 +426,7 @@ class SDFField(nn.Module):
             h = self.lin1(torch.cat([x, feat[:, :, 0].flatten(1)], 1))  # (P,H)
             out = self.lin2(F.softplus(h, BETA))  # (P,1+GEO)
             ds_dz = (torch.sigmoid(BETA * h) * self.lin2.weight[0]) @ self.lin1.weight  # (P,3+LC)
-            ds_df = ds_dz[:, 3:].reshape(len(x), self.octree.levels, 1, -1)  # (P,L,1,C)
+            ds_df = ds_dz[:, None, None, 3:].reshape(feat[:, :, :1].shape)  # (P,L,1,C)
             per_unit = (self.octree.scale / (2 * self.octree.half))[:, None, None]  # (L,1,1) cells
             grad = ds_dz[:, :3] + (feat[:, :, 1:] * (ds_df * per_unit)).sum((1, 3))  # (P,3)
         return out[:, 0], out[:, 1:], grad
@@ -1186,7 +1186,11 @@ def make_meter(device: torch.device) -> EnergyMeter:
     except ImportError:
         print("  no GPU energy: pip install nvidia-ml-py")
         return EnergyMeter()
-    pynvml.nvmlInit()
+    try:
+        pynvml.nvmlInit()
+    except pynvml.NVMLError as error:
+        print(f"  no GPU energy: {error}")
+        return EnergyMeter()
     uuid = torch.cuda.get_device_properties(device).uuid
     gpu = pynvml.nvmlDeviceGetHandleByUUID(f"GPU-{uuid}")
     return EnergyMeter("nvml", lambda: pynvml.nvmlDeviceGetTotalEnergyConsumption(gpu) / 1e3,
@@ -2044,10 +2048,15 @@ def main(argv: list[str] | None = None) -> None:
 def run_command_line(entry) -> None:
     """Exit code 0, or 2 with one sentence on stderr."""
     try:
-        entry()
+        return entry()
     except UserError as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(2)
+        message = str(error)
+    except OSError as error:  # a full disk, a folder without permission
+        message = f"{error}: free or choose a place, then go on with --resume"
+    except KeyboardInterrupt:  # outside the training loop, which ends its step and saves
+        message = "stopped; the last checkpoint stays, --resume goes on from it"
+    print(f"error: {message}", file=sys.stderr)
+    sys.exit(2)
 
 
 if __name__ == "__main__":

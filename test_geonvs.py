@@ -2457,6 +2457,19 @@ def refinable(levels=4, **changes):
     return model
 
 
+def test_refining_a_tree_with_empty_levels_works(warm):
+    model = copy.deepcopy(warm)
+    octree = model.sdf.octree = g.Octree(1.0, 6, 2)  # nothing is split: levels 1 to 5 have no cells
+    model.sdf.lin1 = nn.Linear(3 + 6 * 2, 16)
+    optimizer = torch.optim.Adam([octree.features])
+    octree.features.sum().backward()
+    optimizer.step()
+    model.hits[:64, :3] = 0.1
+    model.refine(optimizer)
+    assert [len(cells) for cells in octree.cells] == [16 ** 3, 0, 0, 0, 0, 0]
+    assert [v.shape for v in model.sdf.with_gradient(torch.zeros(0, 3))] == [(0,), (0, g.GEO), (0, 3)]
+
+
 @pytest.mark.parametrize("refined", [0, 1])
 def test_refining_goes_from_coarse_to_fine(refined):
     model = refinable(levels=6, split_error=0.1)
@@ -3549,6 +3562,16 @@ def test_baselines_run_by_the_same_command(desk, method):
     assert "leaky" in metrics["protocol"]  # and says so
     assert metrics["method"] == method and metrics["psnr"] > 0 and metrics["sdf_error"] is None
     assert metrics["octree_cells"] is None and not (desk / "runs" / "a" / "mesh.ply").exists()
+
+
+@pytest.mark.parametrize("problem", [UserError("x"), OSError(28, "No space left on device"), KeyboardInterrupt()])
+def test_problems_end_with_code_2_and_one_line(capsys, problem):
+    def entry():
+        raise problem
+    with pytest.raises(SystemExit) as end:
+        g.run_command_line(entry)
+    err = capsys.readouterr().err
+    assert end.value.code == 2 and err.startswith("error: ") and err.count("\n") == 1
 
 
 BAD_COMMANDS = {
