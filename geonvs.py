@@ -39,6 +39,7 @@ Where the printed paper is departed from, the line carries its tag:
 from __future__ import annotations
 
 import argparse
+import contextlib
 import difflib
 import itertools
 import json
@@ -51,7 +52,9 @@ import sys
 import threading
 import time
 import zlib
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, field, fields
+from multiprocessing import get_context
 from pathlib import Path
 from typing import NamedTuple
 
@@ -81,6 +84,8 @@ class Config:
     scene: str = opt("toy", "toy, brandenburg, sacre, trevi or taj")
     data: str = opt("", "an IMC-PT or COLMAP folder instead of a named scene")
     method: str = opt("geonvsw", "which model to train", "geonvsw", "nerfw", "hanerf")
+    preset: str = opt("default", "quality against speed: see PRESETS", "fast", "default", "best")
+    tuned: bool = opt(False, "a baseline's settings that serve the toy best, not its paper's")
     name: str = opt("", "run folder below runs/ (default: scene-method-seed)")
     seed: int = opt(0, "seed of everything random")
     device: str = opt("auto", "auto, cpu, cuda or cuda:N")
@@ -122,13 +127,16 @@ class Config:
     lr_net: float = opt(2e-3, "learning rate of networks and codes")
     lr_zeta: float = opt(1e-3, "learning rate of the deviation network")
     curve: bool = opt(False, "record PSNR of held-out left halves over s and Wh, for --chart")
-    amp: bool = opt(True, "mixed precision on a GPU [D9]")
+    amp: str = opt("auto", "mixed precision; auto: on a GPU [D9]", "auto", "on", "off")
     protocol: str = opt("half", "half: fit left, score right [D12]; leaky: all", "half", "leaky")
 
 
 LARGE = dict(steps=300_000, rays=4096, photos=16, samples=32, bg_samples=16, appearance_dim=32)
 # settings that differ from Config's defaults, by scene; flags override them
 SCENES = {"toy": dict(steps=3000), **{name: LARGE for name in data_prep.SCENES}}
+# factors on the scene's settings, from the front that --front measures
+PRESETS = {"fast": dict(steps=0.5, samples=0.5, bg_samples=0.5), "default": {},
+           "best": dict(steps=2, rays=2, samples=1.5, bg_samples=1.5)}
 
 
 # ---- 2 Scene file and rays -----------------------------------------------------------------------
@@ -368,7 +376,8 @@ class Octree(nn.Module):
         fx, fy, fz = inside.reshape(-1, 3).T.contiguous()  # (PL,)
         yz = fy * fz
         basis = torch.stack([torch.ones_like(fx), fz, fy, yz, fx, fx * fz, fx * fy, fx * yz], 1)
-        w = basis @ TRILINEAR[:, :8 * J].to(x.device)  # (PL,8) to (PL,8J)
+        with torch.autocast(x.device.type, enabled=False):  # [D9]
+            w = basis @ TRILINEAR[:, :8 * J].to(x.device)  # (PL,8) to (PL,8J)
         out = Interpolate.apply(self.features, corner.reshape(-1, 8), w.reshape(-1, J, 8))
         return out.reshape(P, L, J, self.features.shape[1])
 
@@ -729,6 +738,10 @@ class Method(nn.Module):
     def maintain(self, step: int, progress: float, optimizer: torch.optim.Optimizer) -> None:
         """After every step."""
 
+    def health(self) -> dict[str, Tensor]:
+        """More figures for a line of the log."""
+        return {}
+
 
 def worst_cells(octree: Octree, level: int, hits: Tensor, bound: float) -> Tensor:
     """Cells (Q,3) where rays end that miss their colour by more than bound on average, and those
@@ -932,6 +945,20 @@ class GeoNVS(Method):
             share = self.logits[~self.scene.is_test].sigmoid().mean().item()
             self.use_mask = share > 0.002
             print(f"  mean mask {share:.4f}: mask {'stays on' if self.use_mask else 'goes off'}")
+
+    @torch.no_grad()
+    def health(self) -> dict[str, Tensor]:
+        """Mean foreground opacity of rays from training photos to SfM points that they show."""
+        raw, scene, dev = self.scene.raw, self.scene, self.cache.device
+        img, x = (torch.as_tensor(raw[f"track_{k}"]).long().to(dev) for k in ("photo", "point"))
+        x = scene.points[x]  # (N,3), seen in photos img (N,)
+        pick = torch.nonzero(~scene.is_test[img] & (x.norm(dim=1) < 0.95))[:, 0]
+        pick = pick[::max(1, len(pick) // 256)]  # (R,)
+        img, o = img[pick], scene.c2w[img[pick], :, 3]  # (R,), (R,3)
+        d = F.normalize(x[pick] - o, dim=1)  # (R,3)
+        rays = Rays(o, d, scene.near[img], img, o[:, :2], o)
+        opacity = self.render(rays, self.appearance(img))["opacity"]
+        return dict(sfm_opacity=opacity.mean()) if len(pick) else {}
 
     def render(self, rays: Rays, code: Tensor) -> dict[str, Tensor]:
         """render_rays without jitter, for pictures and for fitting codes."""
@@ -1199,12 +1226,27 @@ def make_meter(device: torch.device) -> EnergyMeter:
 
 # ---- 10 Training ---------------------------------------------------------------------------------
 
-METHODS = {  # and the published settings of the baselines
-    "geonvsw": (GeoNVS, {}),
-    "nerfw": (NeRFW, dict(rays=1024, photos=1024, samples=64, hidden=256, lr_net=5e-4)),
-    "hanerf": (HaNeRF, dict(rays=1024, photos=1, samples=64, hidden=256, lr_net=5e-4)),
+METHODS = {  # the published settings of the baselines, then those that serve the toy best
+    "geonvsw": (GeoNVS, {}, {}),
+    "nerfw": (NeRFW, dict(rays=1024, photos=1024, samples=64, hidden=256, lr_net=5e-4),
+              dict(rays=512, photos=512, samples=32, hidden=96, lr_net=2e-3)),
+    "hanerf": (HaNeRF, dict(rays=1024, photos=1, samples=64, hidden=256, lr_net=5e-4),
+               dict(samples=32, hidden=96, lr_net=2e-3)),
 }
 CHECKPOINT_S = 60.0  # seconds of training between checkpoints
+PATIENCE = 20  # steps in a row without a finite loss and gradient that stop a run
+HEALTH = {  # lowest and highest healthy value after a third of training, and what it can mean
+    "zeta": (30, math.inf, "the surface stays blurred: wrong poses or scale, or too few steps"),
+    "sfm_opacity": (0.7, math.inf, "rays to SfM points pass through: the background paints the "
+                    "landmark; raise --lam_sfm or train longer"),
+    "mask": (0, 0.5, "the mask covers half of the picture: raise --lam_mask"),
+    "eik": (0, 0.5, "the SDF is no distance: raise --lam_eik or lower --lr_grid"),
+    "miss": (0, 0.6, "most rays miss the unit sphere: is it the right landmark that it surrounds?"),
+}
+
+
+class Diverged(UserError):
+    """Training was stopped, as its losses or gradients were not finite."""
 
 
 def make_optimizer(model: Method) -> torch.optim.Adam:
@@ -1241,7 +1283,8 @@ def read_checkpoint(path: Path, device="cpu") -> dict:
         raise UserError(f"{path} is damaged or not a checkpoint ({type(error).__name__}): "
                         "delete it and train again") from None
     known = {f.name for f in fields(Config)}
-    if not isinstance(saved, dict) or saved.get("geonvs") != 1 or set(saved.get("config", ())) != known:
+    ours = isinstance(saved, dict) and saved.get("geonvs") == 1
+    if not ours or set(saved.get("config", ())) != known:
         raise UserError(f"{path} is not a checkpoint of this program: delete it and train again")
     return saved
 
@@ -1269,7 +1312,8 @@ def training_step(model: Method, optimizer, photos: Tensor, state: dict, progres
     """One update. Returns the logs, and 1 if a loss or gradient that is not finite made it void."""
     cfg, device = model.cfg, photos.device
     rays, pick = model.batch(photos, gen)
-    with torch.autocast(device.type, torch.bfloat16, enabled=cfg.amp and device.type == "cuda"):
+    is_half = cfg.amp == "on" or cfg.amp == "auto" and device.type == "cuda"
+    with torch.autocast(device.type, torch.bfloat16, enabled=is_half):
         loss, logs = model.losses(rays, pick, progress, gen)
     optimizer.zero_grad()
     loss.backward()
@@ -1305,6 +1349,7 @@ def train(cfg: Config, scene: Scene, run: Path, saved: dict | None = None):
     write_text(log_path, "".join(k for k in lines if json.loads(k)["step"] <= state["step"]))
     photos, held_out, codes = scene.photos(False), scene.photos(True), None  # (B,)
     dropped = torch.tensor(state["dropped"], device=device)
+    streak, warned = torch.zeros_like(dropped), set()  # void steps in a row; warnings given
     last_save = last_line = since = time.perf_counter()
     meter.start()
     if saved is None:
@@ -1326,6 +1371,9 @@ def train(cfg: Config, scene: Scene, run: Path, saved: dict | None = None):
             progress = max(state["step"] / cfg.steps, spent)
             logs, is_dropped = training_step(model, optimizer, photos, state, progress, gen)
             dropped += is_dropped
+            streak = (streak + 1) * is_dropped
+            if state["step"] % PATIENCE == 0 and int(streak) >= PATIENCE:
+                break
             if cfg.curve and len(held_out) and clock() > 4 * 1.5 ** len(state["curve"]):
                 state["seconds"] = clock()
                 meter.stop()  # looking costs neither time nor energy
@@ -1336,7 +1384,12 @@ def train(cfg: Config, scene: Scene, run: Path, saved: dict | None = None):
                 since = time.perf_counter()
             if time.perf_counter() - last_line > 5 or state["step"] == cfg.steps:
                 last_line = time.perf_counter()
+                logs = model.health() | logs
                 report_line(cfg, log_path, state["step"], clock(), progress, logs, int(dropped))
+                for name, (low, high, meaning) in HEALTH.items() if progress > 1 / 3 else ():
+                    if name in logs and name not in warned and not low <= logs[name] <= high:
+                        warned.add(name)
+                        print(f"  warning: {name} is {logs[name]:.3g}: {meaning}")
             if time.perf_counter() - last_save > CHECKPOINT_S:
                 save()
                 last_save = time.perf_counter()
@@ -1344,6 +1397,10 @@ def train(cfg: Config, scene: Scene, run: Path, saved: dict | None = None):
         signal.signal(signal.SIGINT, handler)
         meter.stop()
     save()
+    if int(streak) >= PATIENCE:
+        raise Diverged(f"the last {int(streak)} steps had no finite loss or gradient; {checkpoint} "
+                       "holds the last good weights. Likely causes: learning rates too high (try a "
+                       "third of --lr_grid and --lr_net), half precision (--amp off), broken poses")
     if stop.is_set():
         raise UserError(f"stopped at step {state['step']}; add --resume to go on")
     state["seconds"] = clock()
@@ -1577,8 +1634,8 @@ def extract_mesh(model: GeoNVS, resolution: int = 0) -> tuple[np.ndarray, np.nda
     n = resolution or min(2 * octree.resolution(octree.levels - 1), 512)
     line = torch.linspace(-1, 1, n + 1, device=cache.device)
     cached = F.interpolate(cache, size=(n + 1,) * 3, mode="trilinear", align_corners=True)[0, 0]
-    r = torch.cartesian_prod(line, line, line).norm(dim=1).reshape(cached.shape)  # (n+1,n+1,n+1)
-    near = (cached.abs() < 6 / cache.shape[-1]) & (r < 1)  # (n+1,n+1,n+1)
+    is_inside = line[:, None, None] ** 2 + line[:, None] ** 2 + line ** 2 < 1  # (n+1,n+1,n+1)
+    near = (cached.abs() < 6 / cache.shape[-1]) & is_inside  # (n+1,n+1,n+1)
     volume = torch.ones_like(cached)
     for index in torch.nonzero(near).split(2 ** 16) if near.any() else ():  # (P,3)
         volume[tuple(index.T)] = model.sdf(index * (2 / n) - 1.0)[0]
@@ -1753,18 +1810,35 @@ def peak_rss() -> int:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
 
 
-# ---- 12 Experiments: speed against accuracy, what each piece buys --------------------------------
+# ---- 12 Experiments: speed against accuracy, what each piece buys, where methods fail ------------
 
-ABLATION = {  # one thing changed at a time
+PIECES = {  # of the method, one changed at a time
     "full": {}, "no GPL": dict(lam_gpl=0.0), "literal GPL": dict(gpl="literal"),
     "no mask": dict(mask="off"), "no appearance": dict(appearance="off"),
     "no SfM term": dict(lam_sfm=0.0), "no background": dict(background="off"),
     "no curvature": dict(lam_curv=0.0), "no Lipschitz": dict(lam_lps=0.0),
     "uniform sampling": dict(sampling="uniform"), "printed alpha": dict(alpha="printed"),
     "finite differences": dict(normals="fd"), "uniform grid": dict(grid="uniform"),
-    "one level less": dict(levels=-1), "one level more": dict(levels=1),
+    "half depth": dict(levels=-1), "double depth": dict(levels=1),  # more than the footprint's
 }
-STYLES = {"geonvsw": ("o-", "#0072B2"), "nerfw": ("s--", "#D55E00"), "hanerf": ("^:", "#009E73")}
+RIVALS = {"geonvsw": {}} | {
+    f"{method}{how}": dict(method=method, tuned=bool(how))
+    for method in ("nerfw", "hanerf") for how in ("", " tuned")}
+FRONT = {f"{rays} rays, {n} samples": dict(rays=rays, samples=n, bg_samples=n)
+         for rays in (256, 512, 1024) for n in (8, 16, 24)}
+CALM = dict(occluders=0.2, exposure=1.0, photos=24, pose_noise=0.0, amp="off")  # of a 64 px toy,
+STRESS = {  # and one knob turned at a time
+    "occluders": (0.0, 0.2, 0.4, 0.6), "exposure": (0.0, 1.0, 2.0), "photos": (6, 12, 24, 48),
+    "pose_noise": (0.0, 1.0, 2.0, 4.0), "amp": ("off", "on")}
+KNOB_UNITS = dict(occluders="share of occluders", exposure="exposure spread", amp="half precision",
+                  photos="training photos", pose_noise="pose noise, px")
+STRESS_METHODS = {piece: PIECES[piece] | dict(steps=500, rays=256) for piece in
+                  ("full", "no GPL", "literal GPL", "no mask", "no appearance")}
+STRESS_METHODS |= {method: RIVALS[f"{method} tuned"] | dict(minutes=0.4, steps=10 ** 6)
+                   for method in ("nerfw", "hanerf")}
+COLORS = "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#999999"
+FIGURES = ("psnr", "psnr_floor", "ssim", "sdf_error", "mask_iou", "mask_static", "octree_bytes",
+           "rays_per_second", "train_seconds", "energy_wh", "parameters")
 
 
 def read_metrics(run: Path) -> dict:
@@ -1773,14 +1847,54 @@ def read_metrics(run: Path) -> dict:
     return json.loads((run / "metrics.json").read_text())
 
 
-def run_once(given: dict, run: Path, arrays: dict | None = None) -> dict:
-    """Metrics of one training; a finished run is read, so that a matrix can go on."""
-    if (run / "metrics.json").exists():
-        return read_metrics(run)
+def run_once(given: dict, run: Path) -> dict:
+    """Metrics of one training; given may hold "toy", knobs of make_toy. What it prints goes to
+    log.txt. A finished run of the same settings is read; one that diverged is a result, too."""
+    toy, given = given.get("toy"), {k: v for k, v in given.items() if k != "toy"}
     cfg = make_config(given)
     check(cfg)
-    print(f"--- {run}", flush=True)
-    return execute(cfg, arrays if arrays is not None else find_scene(cfg), run)
+    if not (run / "metrics.json").exists() or read_metrics(run)["config"] != asdict(cfg):
+        run.mkdir(parents=True, exist_ok=True)
+        with open(run / "log.txt", "w") as log, contextlib.redirect_stdout(log):
+            try:
+                execute(cfg, data_prep.make_toy(**toy) if toy else find_scene(cfg), run)
+            except Diverged as error:
+                write_text(run / "metrics.json", json.dumps(
+                    dict(failed=str(error), method=cfg.method, curve=[], config=asdict(cfg))))
+    metrics = read_metrics(run)
+    said = metrics.get("failed") or "{psnr:.2f} dB, {train_seconds:.0f} s".format(**metrics)
+    print(f"{run}: {said}", flush=True)
+    return metrics
+
+
+def matrix(kind: str, rows: dict[str, dict], given: dict, seeds: int, workers: int = 1) -> dict:
+    """Metrics, a list over seeds, of every row (settings by name). workers: CPU processes that
+    train side by side, a thread each, which is faster than one after the other with all threads."""
+    find_scene(make_config(given))  # made once, before the processes start
+    folder = Path("runs") / kind
+    jobs = [(given | row | dict(seed=seed), folder / f"{name}-{seed}".replace(" ", "_"))
+            for name, row in rows.items() for seed in range(seeds)]
+    if workers == 1:
+        done = [run_once(*job) for job in jobs]
+    else:
+        spawn = get_context("spawn")
+        with ProcessPoolExecutor(workers, spawn, torch.set_num_threads, (1,)) as pool:
+            done = list(pool.map(run_once, *zip(*jobs)))
+    return {name: done[i * seeds:(i + 1) * seeds] for i, name in enumerate(rows)}
+
+
+def has_failed(metrics: dict) -> bool:
+    """Did a run diverge, or end below a picture of one colour?"""
+    return "failed" in metrics or metrics["psnr"] < metrics["psnr_mean_color"]
+
+
+def table_line(name: dict, metrics: list[dict]) -> dict:
+    """A line of a table: mean and spread over seeds. Failures count, in a column of their own."""
+    cells = [m["octree_cells"] for m in metrics if m.get("octree_cells")]
+    line = name | dict(runs=len(metrics), failures=sum(map(has_failed, metrics)),
+                       cells=float(np.mean([sum(c) for c in cells])) if cells else None)
+    pairs = ((key, summary(metrics, key)) for key in FIGURES)
+    return line | {k: v for key, pair in pairs for k, v in zip((key, key + "_std"), pair)}
 
 
 def write_table(path: Path, rows: list[dict]) -> None:
@@ -1789,6 +1903,7 @@ def write_table(path: Path, rows: list[dict]) -> None:
         return "" if v is None else f"{v:.5g}" if isinstance(v, float) else str(v)
     lines = [list(rows[0])] + [[cell(v) for v in row.values()] for row in rows]
     write_text(path, "".join(",".join(line) + "\n" for line in lines))
+    print(f"wrote {path}")
 
 
 def plotting():
@@ -1805,12 +1920,6 @@ def save_figure(figure, path: Path) -> None:
     print(f"wrote {path}")
 
 
-def spreads(metrics: list[dict], *keys: str) -> dict:
-    """Mean and spread over runs of several figures, as cells of a table."""
-    pairs = ((key, summary(metrics, key)) for key in keys)
-    return {name: v for key, (mean, std) in pairs for name, v in ((key, mean), (key + "_std", std))}
-
-
 def reached(curve: list[dict], level: float, unit: str) -> float | None:
     """Seconds or watt-hours at which a curve first reaches a PSNR, log-interpolated, or None."""
     for a, b in zip([None] + curve, curve):
@@ -1822,27 +1931,29 @@ def reached(curve: list[dict], level: float, unit: str) -> float | None:
     return None
 
 
-def by_method(metrics: list[dict]) -> dict[str, list[dict]]:
-    groups = {method: [m for m in metrics if m["method"] == method] for method in METHODS}
-    return {method: mine for method, mine in groups.items() if mine}
+def pareto(points: list[tuple]) -> list[tuple]:
+    """Of points (cost, quality) those that no other beats at the same cost or less."""
+    return [(x, y) for x, y in points if not any(a <= x and b > y for a, b in points)]
 
 
-def plot_curves(axis, metrics: list[dict], unit: str, xlabel: str) -> None:
-    """PSNR over seconds or watt-hours: a line for each method's mean, a band from worst to best."""
-    for method, mine in by_method(metrics).items():
-        curves = [m["curve"] for m in mine if m["curve"]]
+def plot_curves(axis, groups: dict[str, list[dict]], unit: str, xlabel: str) -> None:
+    """PSNR over seconds or watt-hours: mean and range over seeds; rings mark the Pareto front."""
+    points = []
+    for i, (name, metrics) in enumerate(groups.items()):
+        curves = [m["curve"] for m in metrics if m["curve"]]
         n = min(map(len, curves), default=0)
         if n and all(c[0][unit] is not None for c in curves):
             x, y = (np.array([[p[k] for p in c[:n]] for c in curves]) for k in (unit, "psnr"))
-            line, color = STYLES[method]
-            label = f"{method} ({len(curves)} seeds)"
-            axis.plot(x.mean(0), y.mean(0), line, color=color, ms=4, label=label)
-            axis.fill_between(x.mean(0), y.min(0), y.max(0), color=color, alpha=0.2)
-    if axis.lines:
+            style = dict(color=COLORS[i % 8], marker="os^Dv"[i % 5], ls=("-", "--", ":")[i % 3])
+            axis.plot(x.mean(0), y.mean(0), label=f"{name} ({len(curves)} seeds)", ms=4, **style)
+            axis.fill_between(x.mean(0), y.min(0), y.max(0), color=COLORS[i % 8], alpha=0.2)
+            points += zip(x.mean(0), y.mean(0))
+    if points:
+        axis.plot(*zip(*pareto(points)), "o", mfc="none", mec="black", ms=9, label="Pareto front")
+        floor, _ = summary([m for metrics in groups.values() for m in metrics], "psnr_floor")
+        axis.axhline(floor, color="grey", lw=1, label="trivial predictor")
         axis.set_xscale("log")
-        floor, _ = summary(metrics, "psnr_floor")
-        axis.axhline(floor, color="grey", lw=1, ls="-.", label="trivial predictor")
-        axis.legend()
+        axis.legend(fontsize=8)
     else:
         axis.text(0.5, 0.5, f"no {unit} in these runs\n(--curve records, energy needs a counter)",
                   ha="center", va="center", transform=axis.transAxes)
@@ -1850,56 +1961,85 @@ def plot_curves(axis, metrics: list[dict], unit: str, xlabel: str) -> None:
     axis.grid(alpha=0.3)
 
 
-def chart(given: dict, runs: list[str], seeds: int) -> None:
-    """chart.png: PSNR over seconds and over watt-hours, one curve a method; chart.csv: a table."""
-    plt = plotting()
-    if not runs:
-        given = dict(minutes=2.0, steps=10 ** 7, curve=True) | given
-        stem = f"runs/chart-{scene_name(make_config(given))}"
-        for seed, method in itertools.product(range(seeds), METHODS):
-            runs = [*runs, f"{stem}-{method}-{seed}"]
-            run_once(given | dict(method=method, seed=seed), Path(runs[-1]))
-    metrics, rows = [read_metrics(Path(run)) for run in runs], []
-    for method, mine in by_method(metrics).items():
-        row = dict(method=method, runs=len(mine)) | spreads(
-            mine, "psnr", "ssim", "psnr_floor", "train_seconds", "energy_wh", "rays_per_second",
-            "parameters")
-        for level in range(14, 32):
-            for unit in ("seconds", "wh"):
-                hits = [reached(m["curve"], level, unit) for m in mine]
-                row[f"{unit}_to_{level}dB"] = None if None in hits else float(np.mean(hits))
+def chart(kind: str, groups: dict[str, list[dict]]) -> None:
+    """<kind>.png: PSNR over seconds and watt-hours, a curve a row; <kind>.csv: the table, with time
+    and energy to fixed PSNR levels and to NeRF-W's end, each beside its ratio to NeRF-W's own."""
+    plt, rows = plotting(), []
+    ends = [m["curve"][-1] for m in groups.get("nerfw", ()) if m["curve"]]
+    for name, metrics in groups.items():
+        row, curves = table_line(dict(row=name), metrics), [m["curve"] for m in metrics]
+        for unit in ("seconds", "wh"):
+            goals = {f"to_{level}dB": level for level in range(14, 32)}
+            goals |= {"to_nerfw_end": np.mean([e["psnr"] for e in ends])} if ends else {}
+            for goal, level in goals.items():
+                hits = [reached(curve, level, unit) for curve in curves]
+                row[f"{unit}_{goal}"] = None if None in hits else float(np.mean(hits))
+            spent, _ = summary(ends, unit)
+            early = row.get(f"{unit}_to_nerfw_end")
+            row[f"{unit}_ratio"] = early / spent if early and spent else None
         rows.append(row)
-    figure, axes = plt.subplots(1, 2, figsize=(11, 4.2), sharey=True)
-    plot_curves(axes[0], metrics, "seconds", "training time, s")
-    plot_curves(axes[1], metrics, "wh", "energy, Wh")
-    figure.suptitle(f"{metrics[0]['scene']}: speed against accuracy ({metrics[0]['device']})")
-    save_figure(figure, Path("chart.png"))
-    write_table(Path("chart.csv"), rows)
+    figure, axes = plt.subplots(1, 2, figsize=(12, 4.5), sharey=True)
+    plot_curves(axes[0], groups, "seconds", "training time, s")
+    plot_curves(axes[1], groups, "wh", "energy, Wh")
+    some = next(m for metrics in groups.values() for m in metrics if "failed" not in m)
+    figure.suptitle(f"{some['scene']}: speed against accuracy ({some['device']})")
+    save_figure(figure, Path(f"{kind}.png"))
+    write_table(Path(f"{kind}.csv"), rows)
 
 
-def ablation(given: dict, seeds: int) -> None:
-    """What each piece buys: ABLATION's rows, mean and spread, as ablation.csv and png."""
-    plt, rows, scene = plotting(), [], scene_name(make_config(given))
-    for name, change in ABLATION.items():
-        if "levels" in change:
-            change = dict(levels=levels + change["levels"])
-        stem = Path("runs") / f"ablation-{scene}-{name.replace(' ', '_')}"
-        metrics = [run_once(given | change | dict(seed=i), Path(f"{stem}-{i}"))
-                   for i in range(seeds)]
-        cells = metrics[0]["octree_cells"]
-        levels = len(cells) if name == "full" else levels
-        rows.append(dict(row=name, runs=seeds, cells=sum(cells)) | spreads(
-            metrics, "psnr", "ssim", "sdf_error", "mask_iou", "mask_static", "octree_bytes",
-            "rays_per_second", "train_seconds"))
-    write_table(Path("ablation.csv"), rows)
-    names, mean, std = zip(*[(r["row"], r["psnr"], r["psnr_std"]) for r in rows])
-    figure, axis = plt.subplots(figsize=(8, 0.35 * len(rows) + 1))
-    axis.barh(names, mean, xerr=std, color=STYLES["geonvsw"][1])
-    axis.axvline(mean[0], color="black", lw=1)
-    axis.invert_yaxis()
-    axis.set(xlabel="PSNR, dB (bar: spread over seeds)", xlim=(min(mean) - 1, None),
-             title=f"{scene}: one piece changed at a time")
+def ablation(given: dict, seeds: int, workers: int) -> None:
+    """What each piece buys, the octree's depth and shape among them: ablation.csv and png."""
+    plt, cfg = plotting(), make_config(given)
+    levels = cfg.levels or levels_for_footprint(float(find_scene(cfg)["footprint"]))
+    rows = {name: row | ({"levels": levels + row["levels"]} if "levels" in row else {})
+            for name, row in PIECES.items()}
+    groups = matrix(f"ablation-{scene_name(cfg)}", rows, given, seeds, workers)
+    table = [table_line(dict(row=name), metrics) for name, metrics in groups.items()]
+    write_table(Path("ablation.csv"), table)
+    shown = dict(psnr="PSNR, dB", sdf_error="SDF error, radii", mask_iou="mask IoU",
+                 octree_bytes="octree, bytes", rays_per_second="training, rays/s")
+    figure, axes = plt.subplots(1, len(shown), figsize=(15, 0.33 * len(table) + 1), sharey=True)
+    for axis, (key, label) in zip(axes, shown.items()):
+        mean, std = ([math.nan if r[k] is None else r[k] for r in table]
+                     for k in (key, key + "_std"))
+        axis.barh([r["row"] for r in table], mean, xerr=std, color=COLORS[0])
+        axis.axvline(mean[0], color="black", lw=1)
+        axis.set(xlabel=label, xlim=(np.nanmin(mean) - 1, None) if key == "psnr" else None)
+    axes[0].invert_yaxis()
+    figure.suptitle(f"{scene_name(cfg)}: one piece changed at a time, {seeds} seeds")
     save_figure(figure, Path("ablation.png"))
+
+
+def stress(given: dict, seeds: int, workers: int) -> None:
+    """Where methods fail: stress.csv and png, over one knob of a small toy at a time."""
+    plt, names, rows = plotting(), {}, {}
+    for knob, values in STRESS.items():
+        for value, (method, settings) in itertools.product(values, STRESS_METHODS.items()):
+            toy = CALM | {knob: value}
+            name = "-".join(map(str, (method, *toy.values())))  # knobs share their calm cell
+            names[knob, value, method] = name
+            rows[name] = settings | dict(amp=toy.pop("amp"), toy=toy | dict(size=64))
+    groups = matrix("stress", rows, given, seeds, workers)
+    table = [table_line(dict(knob=knob, value=value, method=method), groups[name])
+             for (knob, value, method), name in names.items()]
+    write_table(Path("stress.csv"), table)
+    figure, axes = plt.subplots(2, len(STRESS), figsize=(16, 7), sharey="row")
+    for pair, (knob, values) in zip(axes.T, STRESS.items()):
+        for i, method in enumerate(STRESS_METHODS):
+            mine = [r for r in table if (r["knob"], r["method"]) == (knob, method)]
+            for axis, key in zip(pair, ("psnr", "sdf_error")):
+                mean, std = ([math.nan if r[k] is None else r[k] for r in mine]
+                             for k in (key, key + "_std"))
+                axis.errorbar(range(len(values)), mean, std, color=COLORS[i], marker="os^Dv<>"[i],
+                              ms=4, capsize=2, label=method)
+                axis.set_xticks(range(len(values)), values)
+        failures = sum(r["failures"] for r in table if r["knob"] == knob)
+        pair[0].set_title(f"{failures} failed runs", fontsize=9)
+        pair[1].set_xlabel(KNOB_UNITS[knob])
+    axes[0, 0].set_ylabel("PSNR, dB")
+    axes[1, 0].set_ylabel("SDF error, radii")
+    axes[0, 0].legend(fontsize=7)
+    save_figure(figure, Path("stress.png"))
 
 
 # ---- 13 Command line -----------------------------------------------------------------------------
@@ -1928,8 +2068,10 @@ def make_parser() -> argparse.ArgumentParser:
     add("--resume", action="store_true", help="go on from the run's checkpoint")
     add("--chart", nargs="*", metavar="RUN", help="speed against accuracy: of finished runs, or of "
         "the three methods trained now")
+    add("--front", action="store_true", help="quality against speed of the method's own knobs")
     add("--ablation", action="store_true", help="what each piece buys")
-    add("--seeds", type=int, help="seeds for --chart and --ablation [3]")
+    add("--stress", action="store_true", help="where methods fail: the toy's knobs, one by one")
+    add("--seeds", type=int, help="seeds of --chart, --front, --ablation and --stress [3]")
     add("--render", choices=("orbit", "appearance"), help="write a short film of a finished run")
     return parser
 
@@ -2020,23 +2162,38 @@ def render_film(kind: str, run: Path, given: dict) -> None:
 
 
 def make_config(given: dict) -> Config:
-    """Config's defaults, then the scene's settings, the method's published ones, and flags."""
-    scene = {} if given.get("data") else SCENES.get(given.get("scene", "toy"), {})
-    return Config(**scene | METHODS[given.get("method", "geonvsw")][1] | given)
+    """Config's defaults, the scene's settings, the method's, the preset's factors, then flags."""
+    chosen = {} if given.get("data") else dict(SCENES.get(given.get("scene", "toy"), {}))
+    _, published, tuned = METHODS[given.get("method", "geonvsw")]
+    chosen |= published | (tuned if given.get("tuned") else {})
+    for name, factor in PRESETS[given.get("preset", "default")].items():
+        chosen[name] = round(chosen.get(name, getattr(Config, name)) * factor)
+    return Config(**chosen | given)
 
 
 def main(argv: list[str] | None = None) -> None:
     given = vars(make_parser().parse_args(argv))
-    names = ("resume", "render", "chart", "ablation", "seeds")
+    names = ("resume", "render", "chart", "front", "ablation", "stress", "seeds")
     commands = {k: given.pop(k) for k in names if k in given}
     cfg, seeds = make_config(given), commands.get("seeds", 3)
     check(cfg)
     device = pick_device(cfg.device)
+    workers = 1 if device.type == "cuda" else os.cpu_count()
+    timed = dict(minutes=2.0, steps=10 ** 6, curve=True) | given  # one at a time, all threads
     run = Path("runs") / (cfg.name or f"{scene_name(cfg)}-{cfg.method}-{cfg.seed}")
-    if "chart" in commands:
-        chart(given, commands["chart"], seeds)
+    if commands.get("chart"):
+        runs = [read_metrics(Path(run)) for run in commands["chart"]]
+        names = [m["method"] + " tuned" * m["config"]["tuned"] for m in runs]
+        chart("chart", {name: [m for m, n in zip(runs, names) if n == name]
+                        for name in RIVALS if name in names})
+    elif "chart" in commands:
+        chart("chart", matrix(f"chart-{scene_name(cfg)}", RIVALS, timed, seeds))
+    elif "front" in commands:
+        chart("front", matrix(f"front-{scene_name(cfg)}", FRONT, timed, seeds))
     elif "ablation" in commands:
-        ablation(given, seeds)
+        ablation(given, seeds, workers)
+    elif "stress" in commands:
+        stress(given, seeds, workers)
     elif "render" in commands:
         render_film(commands["render"], run, given)
     else:

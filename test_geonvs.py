@@ -2928,6 +2928,63 @@ def test_the_same_seed_repeats_bit_for_bit_and_another_does_not(scene, tmp_path,
     assert not torch.equal(other.sdf.lin1.weight, again.sdf.lin1.weight)
 
 
+def poisoned(monkeypatch, since=0):
+    """From a step on, the loss is not a number."""
+    losses = g.GeoNVS.losses
+
+    def poison(self, *args):
+        total, logs = losses(self, *args)
+        return (total * math.nan if self.step >= since else total), logs
+    monkeypatch.setattr(g.GeoNVS, "losses", poison)
+
+
+def test_a_run_that_never_recovers_stops_with_its_last_good_weights(scene, tmp_path, brief, monkeypatch, six):
+    poisoned(monkeypatch, since=2)
+    with pytest.raises(g.Diverged, match="learning rate") as caught:
+        run_training(scene, tmp_path, steps=1000)
+    saved = g.read_checkpoint(tmp_path / "checkpoint.pt")
+    assert saved["state"]["step"] <= 3 * g.PATIENCE and str(tmp_path / "checkpoint.pt") in str(caught.value)
+    assert saved["state"]["dropped"] == saved["state"]["step"] - 2
+    assert all(torch.isfinite(v).all() for v in saved["model"].values() if torch.is_tensor(v))
+
+
+def test_a_diverged_run_of_a_matrix_is_a_result(arrays, tmp_path, brief, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    poisoned(monkeypatch)
+    monkeypatch.setattr(g, "find_scene", lambda cfg: arrays)
+    metrics = g.run_once(TINY | dict(steps=1000), tmp_path / "run")
+    assert "finite" in metrics["failed"] and g.has_failed(metrics)
+    assert g.run_once(TINY | dict(steps=1000), tmp_path / "run") == metrics
+
+
+def test_an_unhealthy_figure_is_warned_of_once(scene, tmp_path, brief, monkeypatch, capsys):
+    clock = itertools.count(0, 10.0)
+    monkeypatch.setattr(g.time, "perf_counter", lambda: next(clock))  # a line after every step
+    monkeypatch.setattr(g, "HEALTH", {"miss": (2, 3, "BAD"), "eik": (0, math.inf, "GOOD")})
+    run_training(scene, tmp_path)
+    out = capsys.readouterr().out
+    assert out.count("step") == 6 and out.count("BAD") == 1 and "GOOD" not in out
+
+
+def test_sfm_opacity_looks_at_points_from_photos_that_show_them(warm, monkeypatch):
+    seen = {}
+
+    def look(rays, code):
+        seen["rays"] = rays
+        return dict(opacity=torch.full_like(rays.near, 0.25))
+    model = copy.deepcopy(warm)
+    monkeypatch.setattr(model, "render", look)
+    assert model.health()["sfm_opacity"] == 0.25
+    rays, points = seen["rays"], warm.scene.points
+    along = ((points - rays.o[:, None]) * rays.d[:, None]).sum(2)  # (R,K)
+    gap = (rays.o[:, None] + along[..., None] * rays.d[:, None] - points).norm(dim=2)  # (R,K)
+    assert gap.min(1)[0].max() < 1e-4 and not warm.scene.is_test[rays.img].any()
+    raw = warm.scene.raw
+    pairs = set(zip(raw["track_photo"].tolist(), raw["track_point"].tolist()))
+    near = [{(i, k) for k in torch.nonzero(row < 1e-4)[:, 0].tolist()} for i, row in zip(rays.img.tolist(), gap)]
+    assert all(pairs & options for options in near)
+
+
 @pytest.mark.parametrize("after", [2, 3, 5])
 def test_resuming_equals_never_having_stopped(scene, tmp_path, brief, six, after):
     shutil.copy(six.run / "log.jsonl", tmp_path / "log.jsonl")  # holds a line beyond the checkpoint
@@ -3454,10 +3511,38 @@ def test_films_have_their_frames(warm, scene, tmp_path, kind):
 
 # ---- 12 experiments ------------------------------------------------------------------------------------
 
-def test_ablation_rows_change_settings_that_exist():
-    assert all(set(change) <= {f.name for f in dataclasses.fields(g.Config)} for change in g.ABLATION.values())
-    assert g.ABLATION["full"] == {}
-    assert all(change[k] != getattr(g.Config(), k) for change in g.ABLATION.values() for k in change)
+@pytest.mark.parametrize("rows", ["PIECES", "RIVALS", "FRONT", "STRESS_METHODS"])
+def test_rows_of_experiments_change_settings_that_exist(rows):
+    known = {f.name for f in dataclasses.fields(g.Config)}
+    assert all(set(row) <= known for row in getattr(g, rows).values())
+
+
+def test_every_row_of_the_ablation_differs_from_the_full_method():
+    assert g.PIECES["full"] == {}
+    assert all(row[k] != getattr(g.Config(), k) for row in g.PIECES.values() for k in row)
+
+
+def test_the_knobs_of_the_stress_chart_turn_away_from_the_calm_toy():
+    assert g.STRESS.keys() == g.CALM.keys() == g.KNOB_UNITS.keys()
+    assert all(g.CALM[knob] in values and len(set(values)) > 1 for knob, values in g.STRESS.items())
+
+
+def test_the_pareto_front_is_what_nothing_beats_at_the_same_cost():
+    assert g.pareto([(1, 10), (2, 9), (3, 12), (3, 11), (4, 12.5)]) == [(1, 10), (3, 12), (4, 12.5)]
+
+
+def test_presets_are_factors_and_flags_override_them():
+    base, fast, best = (g.make_config(dict(preset=name)) for name in ("default", "fast", "best"))
+    assert fast.samples < base.samples < best.samples and fast.steps < base.steps < best.steps
+    assert base.samples == g.make_config({}).samples
+    assert g.make_config(dict(preset="fast", samples=12)).samples == 12
+    sacre = g.make_config(dict(preset="best", scene="sacre"))
+    assert sacre.samples == round(g.LARGE["samples"] * g.PRESETS["best"]["samples"])
+
+
+def test_tuned_baselines_replace_published_settings():
+    published, tuned = (g.make_config(dict(method="nerfw", tuned=t)) for t in (False, True))
+    assert (published.hidden, published.samples) == (256, 64) and tuned.hidden < 256
 
 
 def test_a_level_is_reached_where_the_curve_crosses_it():
@@ -3481,7 +3566,9 @@ def finished(folder, **metrics):
     """A run folder as training leaves it."""
     folder.mkdir(parents=True)
     curve = [dict(step=i, seconds=2.0 ** i, psnr=15.0 + i, wh=None) for i in range(3)]
-    base = dict(scene="toy", device="cpu", curve=curve, psnr_floor=14.0, psnr=18.0, energy_wh=None)
+    base = dict(scene="toy", device="cpu", curve=curve, psnr_floor=14.0, psnr=18.0, energy_wh=None,
+                psnr_mean_color=13.0, train_seconds=4.0,
+                config=dataclasses.asdict(g.make_config(dict(steps=1))))
     (folder / "metrics.json").write_text(json.dumps(base | metrics))
     return str(folder)
 
@@ -3502,12 +3589,80 @@ def test_chart_of_finished_runs_writes_picture_and_table(tmp_path, monkeypatch):
 def test_chart_without_matplotlib_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     with pytest.raises(UserError, match="pip install matplotlib"):
-        g.chart({}, ["somewhere"], 1)
+        g.chart("chart", {})
 
 
 def test_a_finished_run_of_a_matrix_is_read_and_not_repeated(tmp_path):
     run = Path(finished(tmp_path / "a", method="geonvsw", psnr=12.5))
     assert g.run_once(dict(steps=1), run)["psnr"] == 12.5
+
+
+def test_a_run_of_other_settings_is_not_taken_for_this_one(tmp_path, monkeypatch):
+    run, calls = Path(finished(tmp_path / "a", method="geonvsw", psnr=12.5)), []
+    monkeypatch.setattr(g, "execute", lambda cfg, arrays, run: calls.append(cfg))
+    monkeypatch.setattr(g, "find_scene", lambda cfg: {})
+    g.run_once(dict(steps=2), run)
+    assert [cfg.steps for cfg in calls] == [2]
+
+
+def test_failures_are_counted_and_their_scores_not_left_out():
+    good = dict(psnr=20.0, psnr_mean_color=12.0, octree_cells=[8, 16])
+    bad, lost = dict(good, psnr=10.0), dict(failed="the last 20 steps ...")
+    line = g.table_line(dict(row="x"), [good, bad, lost])
+    assert (line["row"], line["runs"], line["failures"]) == ("x", 3, 2)
+    assert line["psnr"] == 15 and line["cells"] == 24 and line["energy_wh"] is None
+
+
+def test_time_ratios_compare_with_where_nerfw_ends(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    runs = {name: [g.read_metrics(Path(finished(tmp_path / name, method=name)))] for name in ("geonvsw", "nerfw")}
+    for i, point in enumerate(runs["geonvsw"][0]["curve"]):
+        point.update(psnr=17.0 + 5 * i)  # is at once where NeRF-W ends after 4 s
+    g.chart("chart", runs)
+    head, *rows = [line.split(",") for line in (tmp_path / "chart.csv").read_text().splitlines()]
+    mine, theirs = (dict(zip(head, row)) for row in rows)
+    assert float(mine["seconds_ratio"]) == pytest.approx(1 / 4) and float(theirs["seconds_ratio"]) == 1
+    assert mine["wh_ratio"] == "" == mine["wh_to_nerfw_end"]
+
+
+SMALL_TOY = dict(occluders=0.2, exposure=1.0, photos=4, pose_noise=0.0, amp="off")
+
+
+def test_stress_fills_its_table_and_picture(tmp_path, monkeypatch, brief):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(g, "CALM", SMALL_TOY)
+    monkeypatch.setattr(g, "STRESS", dict(pose_noise=(0.0, 2.0), amp=("off", "on")))
+    monkeypatch.setattr(g, "STRESS_METHODS", {"full": {}, "no mask": dict(mask="off")})
+    monkeypatch.setattr(g, "find_scene", lambda cfg: {})
+    g.stress({k: v for k, v in (TINY | dict(steps=2)).items()}, 1, 1)
+    head, *rows = [line.split(",") for line in (tmp_path / "stress.csv").read_text().splitlines()]
+    rows = [dict(zip(head, row)) for row in rows]
+    assert [(r["knob"], r["value"], r["method"]) for r in rows] == [
+        (k, v, m) for k, v in (("pose_noise", "0"), ("pose_noise", "2"), ("amp", "off"), ("amp", "on"))
+        for m in ("full", "no mask")]
+    same = [[r[k] for k in head[3:]] for r in rows if (r["knob"], r["value"]) in (("pose_noise", "0"), ("amp", "off"))]
+    assert same[:2] == same[2:] and all(r["psnr"] for r in rows)  # knobs share the calm cell
+    assert len(list((tmp_path / "runs" / "stress").iterdir())) == 6 and (tmp_path / "stress.png").exists()
+
+
+def test_processes_side_by_side_give_the_runs_of_one(tmp_path, monkeypatch, arrays):
+    monkeypatch.chdir(tmp_path)
+    data_prep.write_scene(tmp_path / "data" / "toy.npz", arrays)
+    row = {"a": TINY | dict(steps=2, mask="off")}
+    (side,), (alone,) = (g.matrix(kind, row, {}, n, n)["a"][:1] for kind, n in (("two", 2), ("one", 1)))
+    assert side["psnr"] == pytest.approx(alone["psnr"], abs=1e-3)
+    assert sorted(p.name for p in (tmp_path / "runs" / "two").iterdir()) == ["a-0", "a-1"]
+
+
+def test_ablation_fills_its_table_with_depths_around_the_footprints(tmp_path, monkeypatch, arrays, brief):
+    monkeypatch.chdir(tmp_path)
+    data_prep.write_scene(tmp_path / "data" / "toy.npz", arrays)
+    monkeypatch.setattr(g, "PIECES", {k: g.PIECES[k] for k in ("full", "no mask", "double depth")})
+    g.ablation(TINY | dict(steps=2, levels=2), 1, 1)
+    head, *rows = [line.split(",") for line in (tmp_path / "ablation.csv").read_text().splitlines()]
+    assert [row[0] for row in rows] == ["full", "no mask", "double depth"] and (tmp_path / "ablation.png").exists()
+    levels = [g.read_metrics(p)["config"]["levels"] for p in sorted((tmp_path / "runs" / "ablation-toy").iterdir())]
+    assert sorted(levels) == [2, 2, 3]
 
 
 # ---- 13 command line -----------------------------------------------------------------------------------
