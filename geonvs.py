@@ -98,7 +98,7 @@ class Config:
     bg_samples: int = opt(16, "background samples per ray")
     levels: int = opt(0, "octree levels, 0: from the pixel footprint at the surface")
     grid: str = opt("octree", "uniform: the same finest cell everywhere", "octree", "uniform")
-    split_error: float = opt(0.02, "mean L1 error of rays that splits the cell they end in [R]")
+    split_error: float = opt(1.0, "a cell is split if its rays err more than this times the median")
     max_mb: float = opt(1000.0, "most memory that the foreground octree may take, MiB")
     bg_levels: int = opt(3, "octree levels of the background")
     channels: int = opt(4, "feature channels per octree level")
@@ -387,15 +387,15 @@ class Octree(nn.Module):
 
 
 def seed_octree(octree: Octree, points: Tensor, dense: int, shell: tuple[float, float]) -> None:
-    """Splits all cells that touch the shell of radii up to level `dense`, then two levels of cells
-    near points: one cell on every side, so that the corners around a point are never hanging."""
+    """Splits all cells that touch the shell of radii up to level `dense`, then cells near points:
+    one cell on every side, so that the corners around a point are never hanging."""
     for level in range(octree.levels - 1):
         if level < dense:
             reach = octree.cell(level) * math.sqrt(3) / 2
             r = octree.centres(level).norm(dim=1)  # (N,)
             touches = (r > shell[0] - reach) & (r < shell[1] + reach)  # (N,)
             octree.split(level, octree.cells[level][touches])
-        elif len(points) and level < dense + 2:
+        elif len(points) and level == dense:
             octree.split(level, octree.around(octree.cell_of(points, level), level))
     octree.features.data[1:].normal_(0, octree.std)
 
@@ -743,18 +743,22 @@ class Method(nn.Module):
         return {}
 
 
-def worst_cells(octree: Octree, level: int, hits: Tensor, bound: float) -> Tensor:
-    """Cells (Q,3) where rays end that miss their colour by more than bound on average, and those
-    around them, worst first. hits: (P,4) where rays ended, and their error."""
-    at, which = octree.cell_of(hits[:, :3], level).unique(dim=0, return_inverse=True)
-    error = hits.new_zeros(len(at)).index_add_(0, which, hits[:, 3])  # (Q,)
-    error = error / torch.bincount(which, minlength=len(at))  # (Q,) mean over the rays
+def worth_splitting(octree: Octree, level: int, hits: Tensor, bound: float) -> Tensor:
+    """Cells (Q,3) where enough rays end, that miss their colour by more than bound on average, and
+    to whose pixels the children are not too fine; worst first. hits: (P,5), the rays' ends, errors
+    and pixel sizes there."""
+    at, which, count = octree.cell_of(hits[:, :3], level).unique(
+        dim=0, return_inverse=True, return_counts=True)
+    mean = hits.new_zeros(len(at), 2).index_add_(0, which, hits[:, 3:]) / count[:, None]  # (Q,2)
+    error, pixel = mean.unbind(1)  # (Q,)
+    pays = (count >= SPLIT_RAYS) & (error > bound) & (pixel < octree.cell(level) / 2)  # (Q,)
     worst = error.argsort(descending=True)
-    return octree.around(at[worst[error[worst] > bound]], level)
+    return at[worst[pays[worst]]]
 
 
 REFINE_AT = (0.1, 0.2, 0.3, 0.45, 0.6)  # shares of training at which the octree is refined
-SPLIT_BYTES = 512  # memory of one split: eight nodes and about as many corners
+SPLIT_RAYS = 4  # recent rays that end in a cell before it is split
+HIDDEN = 6.0  # zeta |s| from where on the field is not seen: sigmoid(-6) = 0.0025
 MASK_FROM = 0.2  # share of training after which the mask may act: before, every pixel is wrong
 
 
@@ -768,8 +772,9 @@ class GeoNVS(Method):
         self.sfm = scene.points[inside]  # (K,3)
         levels = cfg.levels or levels_for_footprint(float(scene.raw["footprint"]))
         octree = Octree(1.0, levels, cfg.channels, dev)
-        dense = 1 if len(self.sfm) and cfg.grid == "octree" else levels
-        seed_octree(octree, self.sfm, dense, (0.0, 1.0))  # [D10]
+        is_octree = len(self.sfm) > 0 and cfg.grid == "octree"
+        dense, radius = (1, 1.0) if is_octree else (levels, math.sqrt(3))
+        seed_octree(octree, self.sfm, dense, (0.0, radius))  # [D10]
         self.eps = octree.cell(levels - 1) / 2
         spread, sky = float(scene.raw["exposure_spread"]), torch.as_tensor(scene.raw["bg_color"])
         has_codes = cfg.appearance == "on" or cfg.appearance == "auto" and spread > 0.01
@@ -789,7 +794,7 @@ class GeoNVS(Method):
             bg_color=sky.float().nan_to_num(0.5), calibration=torch.tensor([0.0, 1.0]),
             level=torch.tensor(0.2),  # running median of the L1 error
             cache=torch.zeros(1, 1, n, n, n),  # SDF on a dense grid, for placing samples [D11]
-            hits=torch.full((2 ** 15, 4), 2.0),  # where recent rays ended, and their error
+            hits=torch.full((2 ** 18, 5), 2.0),  # where recent rays ended, their error, pixel size
             logits=torch.full((I, 1, m, m), -9.0),  # last output of the mask network
             seen=torch.full((I, 2, m, m), -1.0))  # last error and Phi by pixel
         for name, value in memory.items():
@@ -861,7 +866,9 @@ class GeoNVS(Method):
             if self.step % cfg.mask_every == 0:
                 total = total + self.mask_objective(pick)
         slot = (self.step * R + torch.arange(R, device=dev)) % len(self.hits)  # (R,)
-        self.hits[slot] = torch.cat([out["x"], ((1 - mask) * misfit)[:, None]], 1).nan_to_num(2, 2, 2)
+        pixel = out["depth"].detach() / self.scene.K[rays.img, 0]  # (R,) its size where the ray ends
+        told = torch.stack([(1 - mask) * misfit, pixel], 1)  # (R,2)
+        self.hits[slot] = torch.cat([out["x"], told], 1).nan_to_num(2, 2, 2)
         health = dict(zeta=self.deviation(), opacity=out["opacity"].mean(),
                       miss=1 - hit.float().mean(), mse=((out["rgb"] - rays.rgb) ** 2).mean())
         return total, {k: v.detach() for k, v in (raw | health).items()}
@@ -910,20 +917,27 @@ class GeoNVS(Method):
     @torch.no_grad()
     def refine(self, optimizer: torch.optim.Optimizer) -> None:
         """Fits the octree to the scene: no fine cell far from the surface or where pictures agree.
-        A cell of level >= 1 stays split while the surface is within a cell of it; worst cells there
-        are newly split, coarse levels first, up to cfg.max_mb. Adam's moments move along."""
-        octree, keys = self.sdf.octree, list(self.sdf.octree.split_keys)
-        hits = self.hits[self.hits[:, 0] < 2]  # (P,4) without the slots that no ray has filled
+        Cells of a level >= 1 are newly split at the surface where that pays, coarse levels first, up
+        to cfg.max_mb. A cell is merged again when none of it, and nothing within a child's side of
+        it, where corners would be pinned, is nearer to the surface than HIDDEN / zeta: a pixel then
+        changes by 2 sigmoid(-HIDDEN) = 0.005 at most if |grad s| = 1. Adam's moments move along."""
+        octree, keys, zeta = self.sdf.octree, list(self.sdf.octree.split_keys), self.deviation()
+        hits = self.hits[self.hits[:, 0] < 2]  # (P,5) without the slots that no ray has filled
+        split_bytes = 8 * (36 + 4 * octree.features.shape[1])  # nodes, and as many corners
+        room = int(max(0, self.cfg.max_mb * 2 ** 20 - octree.bytes()) // split_bytes)
         for level in range(1, octree.levels - 1):
-            s = torch.cat([self.sdf(x)[0] for x in octree.centres(level).split(CHUNK)])  # (N,)
-            is_close = s.abs() < (math.sqrt(3) / 2 + 1) * octree.cell(level)  # (N,)
-            close = octree.key(octree.cells[level][is_close], level)
-            worst = worst_cells(octree, level, hits, self.cfg.split_error)  # (Q,3)
-            new = octree.key(worst, level)
-            new = new[torch.isin(new, close) & ~torch.isin(new, keys[level])]
-            new = new if level <= 2 * self.refined + 1 else new[:0]
-            room = int(max(0, self.cfg.max_mb * 2 ** 20 - octree.bytes()) // SPLIT_BYTES)
-            keys[level] = torch.cat([keys[level][torch.isin(keys[level], close)], new[:room]])
+            if not len(octree.cells[level]):
+                break
+            s = torch.cat([self.sdf(x)[0] for x in octree.centres(level).split(CHUNK)]).abs()  # (N,)
+            reach = (math.sqrt(3) / 2 + 1) * octree.cell(level)
+            key = octree.key(octree.cells[level], level)  # (N,)
+            keys[level] = keys[level][torch.isin(keys[level], key[s < reach + HIDDEN / zeta])]
+            bound = self.cfg.split_error * self.level
+            new = octree.key(worth_splitting(octree, level, hits, bound), level)
+            new = new[torch.isin(new, key[s < reach]) & ~torch.isin(new, keys[level])]
+            new = new[:room] if level <= 2 * self.refined + 1 else new[:0]
+            room -= len(new)
+            keys[level] = torch.cat([keys[level], new])
         old = octree.features
         old_row = octree.build(keys)
         moments = optimizer.state.pop(old).items()
