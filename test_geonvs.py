@@ -3657,8 +3657,9 @@ def test_time_ratios_compare_with_where_nerfw_ends(tmp_path, monkeypatch):
     g.chart("chart", runs)
     head, *rows = [line.split(",") for line in (tmp_path / "chart.csv").read_text().splitlines()]
     mine, theirs = (dict(zip(head, row)) for row in rows)
-    assert float(mine["seconds_ratio"]) == pytest.approx(1 / 4) and float(theirs["seconds_ratio"]) == 1
-    assert mine["wh_ratio"] == "" == mine["wh_to_nerfw_end"]
+    assert float(mine["seconds_ratio_nerfw_end"]) == pytest.approx(1 / 4)
+    assert float(theirs["seconds_ratio_nerfw_end"]) == 1 and "seconds_ratio_hanerf_end" not in head
+    assert mine["wh_ratio_nerfw_end"] == "" == mine["wh_to_nerfw_end"]
 
 
 SMALL_TOY = dict(occluders=0.2, exposure=1.0, photos=4, pose_noise=0.0, amp="off")
