@@ -7,6 +7,7 @@ the sections follow one ray from the pixel to the loss, then the training loop a
     python geonvs.py                       toy scene: made, trained, scored (minutes, 2 CPU cores)
     python geonvs.py --scene brandenburg   a Phototourism scene (one GPU); also sacre, trevi, taj
     python geonvs.py --data DIR            your own COLMAP folder
+    torchrun --nproc_per_node 4 geonvs.py  the same on 4 GPUs, that share the rays of each step
     python geonvs.py --help                every setting with its meaning, unit and source
 
 A run writes runs/<name>/: metrics.json, log.jsonl, checkpoint.pt, panel.png, mesh.ply.
@@ -61,6 +62,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 import torch
+import torch.distributed as dist
 import torch.nn.functional as F
 from skimage.measure import marching_cubes
 from skimage.metrics import structural_similarity
@@ -92,7 +94,7 @@ class Config:
     steps: int = opt(4000, "training steps")
     minutes: float = opt(0.0, "training budget in minutes, 0: until --steps is reached")
     downscale: int = opt(2, "integer factor by which photos are made smaller (benchmarks use 2)")
-    rays: int = opt(512, "rays per step")
+    rays: int = opt(512, "rays per step, of all processes together")
     photos: int = opt(8, "photos per step; the mask network sees these whole")
     samples: int = opt(16, "foreground samples per ray")
     bg_samples: int = opt(16, "background samples per ray")
@@ -839,7 +841,7 @@ class GeoNVS(Method):
         """The objective, Eq. 5: its weighted sum, and by name the raw terms and health signals."""
         cfg, R, K, dev = self.cfg, len(rays.o), len(self.sfm), rays.o.device
         jitter = torch.rand(R, cfg.samples + cfg.bg_samples, generator=gen, device=dev)  # (R,S+B)
-        out = render_rays(self, rays, self.appearance(rays.img), jitter)
+        out = in_shares(lambda *v: render_rays(self, *v), rays, self.appearance(rays.img), jitter)
         e_grad, e_curv, hit = out["e_grad"], out["e_curv"], out["hit"]  # (R,)
         error = (out["rgb"] - rays.rgb).abs().mean(1)  # (R,) L1
         is_masking = self.use_mask and progress > MASK_FROM
@@ -849,7 +851,8 @@ class GeoNVS(Method):
         edge = edge_indicator(e_grad, e_curv, cfg.lam_grad, cfg.lam_lap, calibration)  # (R,)
         edge = out["opacity"].detach() * edge  # (R,)
         sfm = torch.randint(max(K, 1), (R // 2 if K else 0,), generator=gen, device=dev)  # (R/2,)
-        s = self.sdf(torch.cat([random_ball(R // 2, gen), self.sfm[sfm]]))[0]  # (R/2 + R/2,)
+        x = torch.cat([random_ball(R // 2, gen), self.sfm[sfm]])  # (R/2 + R/2,3)
+        s = in_shares(lambda x: dict(sdf=self.sdf(x)[0]), x)["sdf"]  # (R/2 + R/2,)
         raw = dict(rgb=((1 - mask) * error).mean(),
                    eik=(out["eikonal"].mean(1) * hit).sum() / hit.sum().clamp(min=1),
                    curv=e_curv.mean(),  # [D4]
@@ -938,6 +941,7 @@ class GeoNVS(Method):
             new = new[:room] if level <= 2 * self.refined + 1 else new[:0]
             room -= len(new)
             keys[level] = torch.cat([keys[level], new])
+        keys = [k.to(hits.device) for k in agreed([k.cpu() for k in keys])]
         old = octree.features
         old_row = octree.build(keys)
         moments = optimizer.state.pop(old).items()
@@ -956,7 +960,7 @@ class GeoNVS(Method):
             self.refine(optimizer)
         self.refined += 1
         if self.refined == len(REFINE_AT) and self.cfg.mask == "auto" and self.use_mask:
-            share = self.logits[~self.scene.is_test].sigmoid().mean().item()
+            share = agreed(self.logits[~self.scene.is_test].sigmoid().mean().item())
             self.use_mask = share > 0.002
             print(f"  mean mask {share:.4f}: mask {'stays on' if self.use_mask else 'goes off'}")
 
@@ -1083,7 +1087,7 @@ class NeRFW(Method):
     def losses(self, rays: Rays, pick: Tensor, progress: float, gen: torch.Generator):
         """NeRF-W Eq. 13: squared error over learned variance, its log, a price on transients."""
         jitter = torch.rand(len(rays.o), 2 * self.cfg.samples, generator=gen, device=rays.o.device)
-        out = self.render(rays, self.codes()[rays.img], jitter, self.transient(rays.img))
+        out = in_shares(self.render, rays, self.codes()[rays.img], jitter, self.transient(rays.img))
         error = ((out["rgb"] - rays.rgb) ** 2).sum(1)  # (R,)
         raw = dict(coarse=((out["coarse"] - rays.rgb) ** 2).mean() / 2,
                    rgb=(error / (2 * out["beta"] ** 2)).mean(),
@@ -1135,7 +1139,7 @@ class HaNeRF(NeRFW):
         R, side = len(rays.o), math.isqrt(self.cfg.rays)
         jitter = torch.rand(R, 2 * self.cfg.samples, generator=gen, device=rays.o.device)
         code = self.encode(pick)  # (1,A)
-        out = self.render(rays, code.expand(R, -1), jitter)
+        out = in_shares(self.render, rays, code.expand(R, -1), jitter)
         mask = self.mask_of(rays, pick)  # (R,)
         error, coarse = (((out[k] - rays.rgb) ** 2).mean(1) for k in ("rgb", "coarse"))  # (R,)
         window = out["rgb"].reshape(1, side, side, 3).permute(0, 3, 1, 2)
@@ -1192,10 +1196,14 @@ class EnergyMeter:
         self.thread.join()
         self.tick()
 
+    def totals(self) -> list[float | None]:
+        """Joules by counter and by samples, over all processes; None if one cannot tell."""
+        each = [(agreed(self.joules, i), agreed(self.sampled_joules, i)) for i in range(RANKS)]
+        return [None if None in joules else sum(joules) for joules in zip(*each)]
+
     def report(self) -> dict:
         """Watt-hours by counter, else by samples; None where there is neither."""
-        joules = self.joules, self.sampled_joules
-        counter, sampled = (None if j is None else j / 3600 for j in joules)
+        counter, sampled = (None if j is None else j / 3600 for j in self.totals())
         off = abs(counter / sampled - 1) > 0.05 if counter and sampled else None
         return dict(energy_wh=sampled if counter is None else counter, energy_wh_sampled=sampled,
                     energy_source=self.source, energy_disagrees=off, idle_w=self.idle_w)
@@ -1220,8 +1228,8 @@ def rapl_meter(root: str = "/sys/class/powercap") -> EnergyMeter:
 
 def make_meter(device: torch.device) -> EnergyMeter:
     """NVML for a GPU, found by UUID whatever CUDA_VISIBLE_DEVICES says; RAPL for a CPU; or none."""
-    if device.type != "cuda":
-        return rapl_meter()
+    if device.type != "cuda":  # one process reads for its whole machine
+        return EnergyMeter("rapl", float) if LOCAL_RANK else rapl_meter()
     try:
         import pynvml
     except ImportError:
@@ -1261,6 +1269,38 @@ HEALTH = {  # lowest and highest healthy value after a third of training, and wh
 
 class Diverged(UserError):
     """Training was stopped, as its losses or gradients were not finite."""
+
+# torchrun starts RANKS processes. All draw the same random numbers and each works on own rows of a
+# step, so that together they do what one does; the first alone speaks, decides, scores and writes.
+RANK, LOCAL_RANK, RANKS = (int(os.environ.get(name, default)) for name, default in (
+    ("RANK", 0), ("LOCAL_RANK", 0), ("WORLD_SIZE", 1)))
+atomic_write = (lambda path, write: None) if RANK else atomic_write
+
+
+def agreed(value, source: int = 0):
+    """The value that one process has, for all of them."""
+    box = [value]
+    if RANKS > 1:
+        dist.broadcast_object_list(box, source)
+    return box[0]
+
+
+def in_shares(f, *rows) -> dict[str, Tensor]:
+    """f(*rows), from R rows to R rows by name: a process computes every RANKS-th, and all get all.
+    Gradients flow to own rows alone, RANKS-fold, as their mean over the processes is taken."""
+    if RANKS == 1:
+        return f(*rows)
+    own = f(*[Rays(*(v[RANK::RANKS] for v in r)) if isinstance(r, Rays) else r[RANK::RANKS]
+              for r in rows])
+    flat = torch.cat([v.reshape(len(v), -1) for v in own.values()], 1)  # (R/RANKS,columns)
+    flat.register_hook(lambda grad: RANKS * grad)
+    whole = flat.new_zeros(len(rows[-1]), flat.shape[1])  # (R,columns)
+    whole[RANK::RANKS] = flat.detach()
+    dist.all_reduce(whole)
+    whole[RANK::RANKS] = flat
+    parts = zip(own.items(), whole.split([v.shape[1:].numel() for v in own.values()], 1))
+    return {name: (part if v.requires_grad else part.detach()).reshape(-1, *v.shape[1:])
+            for (name, v), part in parts}
 
 
 def make_optimizer(model: Method) -> torch.optim.Adam:
@@ -1333,7 +1373,12 @@ def training_step(model: Method, optimizer, photos: Tensor, state: dict, progres
     loss.backward()
     set_learning_rate(optimizer, state["step"], progress)
     parameters = [p for group in optimizer.param_groups for p in group["params"]]
-    norm = nn.utils.get_total_norm([p.grad for p in parameters if p.grad is not None])
+    grads = [p.grad for p in parameters if p.grad is not None]
+    if RANKS > 1:  # their mean over the processes
+        flat = nn.utils.parameters_to_vector(grads)
+        dist.all_reduce(flat)
+        nn.utils.vector_to_parameters(flat.div_(RANKS), grads)
+    norm = nn.utils.get_total_norm(grads)
     optimizer.found_inf = (~torch.isfinite(norm + loss.detach())).float()
     optimizer.step()
     model.maintain(state["step"], progress, optimizer)
@@ -1356,6 +1401,7 @@ def train(cfg: Config, scene: Scene, run: Path, saved: dict | None = None):
     lines = []
     if saved is not None:
         state = restore(saved, checkpoint, model, optimizer, gen)
+        state |= dict(joules=0.0, sampled_joules=0.0) if RANK else {}  # what all spent counts once
         meter.joules = state["joules"] if meter.counter else None  # all of it was measured, or None
         meter.sampled_joules = state["sampled_joules"] if meter.power else None
         if log_path.exists():
@@ -1364,39 +1410,44 @@ def train(cfg: Config, scene: Scene, run: Path, saved: dict | None = None):
     photos, held_out, codes = scene.photos(False), scene.photos(True), None  # (B,)
     dropped = torch.tensor(state["dropped"], device=device)
     streak, warned = torch.zeros_like(dropped), set()  # void steps in a row; warnings given
-    last_save = last_line = since = time.perf_counter()
+    last_line = since = time.perf_counter()
+    last_save = state["seconds"]
     meter.start()
     if saved is None:
         model.start(gen)
+    for value in model.state_dict().values():
+        if RANKS > 1 and torch.is_tensor(value):  # GPUs do not repeat their sums to the last bit
+            dist.broadcast(value, 0)
 
     def clock():  # training seconds so far
         return state["seconds"] + time.perf_counter() - since
 
     def save():
-        state.update(joules=meter.joules, sampled_joules=meter.sampled_joules, dropped=int(dropped))
+        state.update(zip(("joules", "sampled_joules"), meter.totals()), dropped=int(dropped))
         save_checkpoint(checkpoint, cfg, model, optimizer, gen, state | dict(seconds=clock()))
     stop = threading.Event()  # Ctrl-C lets a step end, so that what is saved is whole
     handler = signal.signal(signal.SIGINT, lambda *_: stop.set())
     try:
-        while state["step"] < cfg.steps and not stop.is_set():
-            if cfg.minutes and clock() >= 60 * cfg.minutes:
-                break
-            spent = clock() / (60 * cfg.minutes) if cfg.minutes else 0
+        while True:
+            seconds, is_stopped = agreed((clock(), stop.is_set()))
+            spent = seconds / (60 * cfg.minutes) if cfg.minutes else 0
             progress = max(state["step"] / cfg.steps, spent)
+            if progress >= 1 or is_stopped:
+                break
             logs, is_dropped = training_step(model, optimizer, photos, state, progress, gen)
             dropped += is_dropped
             streak = (streak + 1) * is_dropped
             if state["step"] % PATIENCE == 0 and int(streak) >= PATIENCE:
                 break
-            if cfg.curve and len(held_out) and clock() > 4 * 1.6 ** len(state["curve"]):
+            if cfg.curve and len(held_out) and seconds > 4 * 1.6 ** len(state["curve"]):
                 state["seconds"] = clock()
                 meter.stop()  # looking costs neither time nor energy
-                codes, value = validate(model, scene, held_out, codes)
+                codes, value = validate(model, scene, held_out, codes) if RANK == 0 else (None, 0)
                 state["curve"].append(dict(step=state["step"], seconds=state["seconds"], psnr=value,
                                            wh=meter.report()["energy_wh"]))
                 meter.start()
                 since = time.perf_counter()
-            if time.perf_counter() - last_line > 5 or state["step"] == cfg.steps:
+            if RANK == 0 and (time.perf_counter() > last_line + 5 or state["step"] == cfg.steps):
                 last_line = time.perf_counter()
                 logs = model.health() | logs
                 report_line(cfg, log_path, state["step"], clock(), progress, logs, int(dropped))
@@ -1404,9 +1455,9 @@ def train(cfg: Config, scene: Scene, run: Path, saved: dict | None = None):
                     if name in logs and name not in warned and not low <= logs[name] <= high:
                         warned.add(name)
                         print(f"  warning: {name} is {logs[name]:.3g}: {meaning}")
-            if time.perf_counter() - last_save > CHECKPOINT_S:
+            if seconds - last_save > CHECKPOINT_S:
                 save()
-                last_save = time.perf_counter()
+                last_save = seconds
     finally:
         signal.signal(signal.SIGINT, handler)
         meter.stop()
@@ -1415,7 +1466,7 @@ def train(cfg: Config, scene: Scene, run: Path, saved: dict | None = None):
         raise Diverged(f"the last {int(streak)} steps had no finite loss or gradient; {checkpoint} "
                        "holds the last good weights. Likely causes: learning rates too high (try a "
                        "third of --lr_grid and --lr_net), half precision (--amp off), broken poses")
-    if stop.is_set():
+    if is_stopped:
         raise UserError(f"stopped at step {state['step']}; add --resume to go on")
     state["seconds"] = clock()
     return model, state, meter
@@ -1735,7 +1786,7 @@ def panel(model, frames: list[tuple[str, dict]], height: int = 180) -> np.ndarra
     return np.concatenate([head, *rows])
 
 
-def finish(model, scene: Scene, cfg: Config, state: dict, meter: EnergyMeter, run: Path) -> dict:
+def finish(model, scene: Scene, cfg: Config, state: dict, energy: dict, run: Path) -> dict:
     """Scores a trained model and writes metrics.json, panel.png and mesh.ply below run."""
     scores = evaluate(model, scene, cfg, make_lpips(scene.rgb.device))
     frames = [(f"held out: {name}", frame) for name, frame in scores.pop("frames")[:3]]
@@ -1756,8 +1807,8 @@ def finish(model, scene: Scene, cfg: Config, state: dict, meter: EnergyMeter, ru
     metrics = dict(
         scene=scene.info["scene"], method=cfg.method, seed=cfg.seed, steps=state["step"],
         device=torch.cuda.get_device_name() if is_gpu else cpu,
-        **scores, train_seconds=state["seconds"], **meter.report(),
-        curve=state["curve"], dropped=state["dropped"],
+        **scores, train_seconds=state["seconds"], **energy,
+        curve=state["curve"], dropped=state["dropped"], processes=RANKS,
         rays_per_second=state["step"] * cfg.rays / max(state["seconds"], 1e-9),
         parameters=sum(p.numel() for p in model.parameters()),
         octree_cells=[len(c) for o in octrees[:1] for c in o.cells] or None,
@@ -2095,16 +2146,17 @@ def make_parser() -> argparse.ArgumentParser:
 
 def pick_device(name: str) -> torch.device:
     if name == "auto":
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+        name = "cuda" if torch.cuda.is_available() else "cpu"
     try:
         device = torch.device(name)
     except RuntimeError:
         raise UserError(f"--device {name} is unknown: use auto, cpu, cuda or cuda:N") from None
     if device.type not in ("cpu", "cuda"):
         raise UserError(f"--device {name} is not supported: use auto, cpu, cuda or cuda:N")
-    if device.type == "cuda" and not torch.cuda.is_available():
-        raise UserError("--device cuda: torch finds no GPU here: use cpu, or a torch with CUDA")
-    return device
+    is_there = torch.cuda.is_available() and LOCAL_RANK < torch.cuda.device_count()
+    if device.type == "cuda" and not is_there:
+        raise UserError("--device cuda: no GPU for this process: use cpu, or a torch with CUDA")
+    return torch.device("cuda", LOCAL_RANK) if device.type == "cuda" and RANKS > 1 else device
 
 
 def scene_name(cfg: Config) -> str:
@@ -2139,7 +2191,7 @@ def check(cfg: Config) -> None:
     for name, value in asdict(cfg).items():
         if isinstance(value, (int, float)) and not 0 <= value < 2 ** 63:
             raise UserError(f"--{name} {value} makes no sense: use a number >= 0")
-    least = dict(samples=2, bg_samples=2, rays=2, mask_px=16) | dict.fromkeys(
+    least = dict(samples=2, bg_samples=2, rays=2 * RANKS, mask_px=16) | dict.fromkeys(
         ("photos", "steps", "downscale", "channels", "hidden", "mask_every", "bg_levels"), 1)
     least |= dict(rays=1024) if cfg.method == "hanerf" else {}  # its encoder reads the grid of rays
     for name, bound in least.items():
@@ -2159,7 +2211,8 @@ def execute(cfg: Config, arrays, run: Path, saved: dict | None = None) -> dict:
     print(f"{cfg.method} on {scene.info['scene']}: {len(scene.wh)} photos "
           f"({len(scene.photos(True))} held out), {len(scene.rgb):,} pixels; {device}; {run}/")
     model, state, meter = train(cfg, scene, run, saved)
-    metrics = finish(model, scene, cfg, state, meter, run)
+    energy = meter.report()  # of all processes
+    metrics = agreed(RANK or finish(model, scene, cfg, state, energy, run))
     shown = ("psnr", "psnr_floor", "ssim", "lpips", "sdf_error", "mask_iou", "mask_static",
              "train_seconds", "energy_wh")
     print("".join(f"  {k} {metrics[k]:.4g}" for k in shown if metrics.get(k) is not None))
@@ -2197,6 +2250,11 @@ def main(argv: list[str] | None = None) -> None:
     device = pick_device(cfg.device)
     workers = 1 if device.type == "cuda" else os.cpu_count()
     timed = dict(minutes=2.0, steps=10 ** 6, curve=True) | given  # one at a time, all threads
+    if RANKS > 1:
+        if device.type == "cuda":
+            torch.cuda.set_device(device)
+        dist.init_process_group("cpu:gloo,cuda:nccl" if device.type == "cuda" else "gloo")
+        sys.stdout = open(os.devnull, "w") if RANK else sys.stdout
     run = Path("runs") / (cfg.name or f"{scene_name(cfg)}-{cfg.method}-{cfg.seed}")
     if commands.get("chart"):
         runs = [read_metrics(Path(run)) for run in commands["chart"]]
@@ -2216,7 +2274,11 @@ def main(argv: list[str] | None = None) -> None:
     else:
         saved = read_checkpoint(run / "checkpoint.pt", device) if "resume" in commands else None
         cfg = Config(**saved["config"] | given) if saved else cfg
-        execute(cfg, find_scene(cfg), run, saved)
+        try:
+            arrays = RANK or find_scene(cfg)
+        finally:  # the others read what the first one made, or fail as it did
+            agreed(None)
+        execute(cfg, find_scene(cfg) if RANK else arrays, run, saved)
 
 
 def run_command_line(entry) -> None:
@@ -2235,3 +2297,5 @@ def run_command_line(entry) -> None:
 
 if __name__ == "__main__":
     run_command_line(main)
+    if RANKS > 1:
+        dist.destroy_process_group()

@@ -12,6 +12,7 @@ import io
 import itertools
 import json
 import math
+import os
 import re
 import shutil
 import signal
@@ -3253,6 +3254,129 @@ def test_learning_rate_warms_up_linearly_and_falls_to_five_percent():
     assert rate(0, 0) == pytest.approx(0.02) and rate(49, 0) == pytest.approx(1.0)
     assert rate(99, 0) == rate(500, 0) == pytest.approx(2.0)
     assert rate(500, 0.5) == pytest.approx(2 * (0.05 + 0.95 / 2)) and rate(999, 1.0) == pytest.approx(0.1)
+
+
+TOGETHER = """
+import json, math, os, shutil, signal
+from pathlib import Path
+import torch, data_prep, geonvs as g
+
+torch.set_num_threads(1)
+os.chdir(where)
+me, runs = f"{g.RANK} of {g.RANKS}", Path("runs")
+begin, toy, step, save, render = g.GeoNVS.start, data_prep.make_toy, g.training_step, g.save_checkpoint, g.render_rays
+curve, meters, trouble, ends = [], [], {}, {}
+
+
+def made():
+    Path(f"made by {me}").touch()
+    return toy(size=24, photos=6, test=1)
+
+
+def logged(model, optimizer, photos, state, *args):
+    if state["step"] == trouble.get("stop"):
+        signal.raise_signal(signal.SIGINT)
+    logs, dropped = step(model, optimizer, photos, state, *args)
+    meters[-1].tick()
+    slopes = {k: p.grad.double().norm().item() for k, p in model.named_parameters() if p.grad is not None}
+    curve.append({k: float(v) for k, v in logs.items()} | slopes)
+    return logs, dropped
+
+
+def metered(device):
+    joules = iter(range(0, 1000, 1 + g.RANK))  # so many from one look to the next
+    meters.append(g.EnergyMeter("fake", lambda: next(joules), period=1e9))
+    return meters[-1]
+
+
+def kept(path, cfg, model, optimizer, gen, state):
+    save(path, cfg, model, optimizer, gen, state)
+    if state["step"] == 4 and g.RANK == 0:
+        shutil.copy(path, "after_4.pt")
+
+
+def scored(model, scene, cfg, state, energy, run):
+    Path(f"scored by {me}").touch()
+    g.write_text(run / "metrics.json", json.dumps(energy))
+    return energy
+
+
+def troubled(model, rays, *args):
+    out = render(model, rays, *args)
+    if g.RANK == g.RANKS - 1 and model.step in trouble:  # on one process alone
+        trouble[model.step](out["rgb"])
+    return out
+
+
+def training(name, saved=None, **changes):
+    curve.clear()
+    (runs / name).mkdir(exist_ok=True)
+    try:
+        model, state, _ = g.train(g.Config(**config | changes), scene, runs / name, saved)
+    except g.UserError as error:
+        return str(error)
+    weights = {k: v for k, v in model.state_dict().items() if torch.is_tensor(v)}
+    return dict(weights=weights, curve=list(curve), joules=state["joules"], dropped=state["dropped"])
+
+
+patch(data_prep, "make_toy", made)
+patch(g.GeoNVS, "start", lambda self, gen: begin(self, gen, 3))
+for name, f in dict(training_step=logged, make_meter=metered, save_checkpoint=kept, CHECKPOINT_S=-1.0,
+                    finish=scored, render_rays=troubled).items():
+    patch(g, name, f)
+g.main([f"--{k}={v}" for k, v in config.items()] + ["--name=whole"])  # makes the scene, meets the other process
+ends["whole"] = list(curve)
+scene = g.load_scene(g.find_scene(g.Config()), "cpu", config["mask_px"])
+ends["resumed"] = training("resumed", g.read_checkpoint(Path("after_4.pt")))
+trouble = {0: lambda rgb: rgb.data.fill_(math.nan), 2: lambda rgb: rgb.register_hook(lambda grad: math.inf * grad)}
+ends["dropped"] = training("dropped", steps=4)
+trouble = dict(stop=1) if g.RANK == 0 else {}
+ends["stopped"] = training("stopped")
+trouble = {}
+for method in ("nerfw", "hanerf"):
+    ends[method] = training(method, method=method, rays=1024, photos=1, samples=2, steps=2)
+torch.save(ends, f"ends of {me}.pt")
+"""
+
+
+def test_two_processes_do_together_what_one_does(tmp_path, monkeypatch):
+    """Uneven shares of a step's rays, refinements, the mask, a resumed run, steps that are not finite on one of two
+    processes, Ctrl-C, the baselines: the same losses, gradients and weights, joules of both, files of the first."""
+    setting = TINY | dict(rays=63, photos=3, levels=3)
+    for name in ("alone", "pair"):
+        (tmp_path / name).mkdir()
+    script = tmp_path / "together.py"
+    script.write_text(f"config, where, patch = {setting!r}, {str(tmp_path / 'pair')!r}, setattr\n" + TOGETHER)
+    env = dict(PYTHONPATH=str(Path(g.__file__).parent), OMP_NUM_THREADS="1",
+               GLOO_SOCKET_IFNAME="lo0" if sys.platform == "darwin" else "lo")
+    torchrun = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2", str(script)]
+    done = subprocess.run(torchrun, env=os.environ | env, capture_output=True, text=True, timeout=900)
+    assert done.returncode == 0, done.stderr[-3000:]
+    monkeypatch.chdir(tmp_path)
+    exec(TOGETHER, dict(config=setting, where=tmp_path / "alone", patch=monkeypatch.setattr))
+
+    alone, first, second = (torch.load(tmp_path / path) for path in (
+        "alone/ends of 0 of 1.pt", "pair/ends of 0 of 2.pt", "pair/ends of 1 of 2.pt"))
+    for name in ("whole", "resumed", "nerfw", "hanerf"):
+        curves = [ends[name] if name == "whole" else ends[name]["curve"] for ends in (alone, first, second)]
+        assert curves[1] == curves[2] and len(curves[0]) == len(curves[1])
+        for a, b in zip(*curves[:2]):
+            close(list(a.values()), [b[k] for k in a], rtol=1e-4, atol=1e-7)
+    for name in ("resumed", "dropped", "nerfw", "hanerf"):
+        a, b, c = (ends[name]["weights"] for ends in (alone, first, second))
+        assert a.keys() == b.keys() and all(torch.equal(b[k], c[k]) and b[k].isfinite().all() for k in b)
+        assert name == "dropped" or all(torch.allclose(a[k], b[k], rtol=1e-4, atol=1e-5) for k in a)
+    assert first["resumed"]["curve"] == first["whole"][4:]
+    assert alone["dropped"]["dropped"] == first["dropped"]["dropped"] == second["dropped"]["dropped"] == 2
+    assert "stopped at step 2" in alone["stopped"] and alone["stopped"] == first["stopped"] == second["stopped"]
+
+    assert alone["resumed"]["joules"] == 7 and first["resumed"]["joules"] == 7 * (1 + 2)
+    metrics = json.loads((tmp_path / "pair/runs/whole/metrics.json").read_text())
+    assert metrics["energy_wh"] == pytest.approx(21 / 3600)
+    assert {p.name for p in (tmp_path / "pair").glob("*by*")} == {"made by 0 of 2", "scored by 0 of 2"}
+    files = {name: sorted(p.relative_to(tmp_path / name) for p in (tmp_path / name).glob("runs/*/*"))
+             for name in ("alone", "pair")}
+    assert files["alone"] == files["pair"] and done.stdout.count("making data") == 1
 
 
 # ---- 11 scoring, mesh, pictures ------------------------------------------------------------------------
