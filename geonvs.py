@@ -1251,9 +1251,9 @@ def make_meter(device: torch.device) -> EnergyMeter:
 METHODS = {  # the published settings of the baselines, then those that serve the toy best
     "geonvsw": (GeoNVS, {}, {}),
     "nerfw": (NeRFW, dict(rays=1024, photos=1024, samples=64, hidden=256, lr_net=5e-4),
-              dict(rays=512, photos=512, samples=32, hidden=96, lr_net=2e-3)),
+              dict(rays=256, photos=256, samples=24, hidden=64, lr_net=5e-3)),
     "hanerf": (HaNeRF, dict(rays=1024, photos=1, samples=64, hidden=256, lr_net=5e-4),
-               dict(samples=32, hidden=96, lr_net=2e-3)),
+               dict(samples=16, hidden=64, lr_net=4e-3)),
 }
 CHECKPOINT_S = 60.0  # seconds of training between checkpoints
 PATIENCE = 20  # steps in a row without a finite loss and gradient that stop a run
