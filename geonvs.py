@@ -368,7 +368,8 @@ class Octree(nn.Module):
         fx, fy, fz = inside.reshape(-1, 3).T.contiguous()  # (PL,)
         yz = fy * fz
         basis = torch.stack([torch.ones_like(fx), fz, fy, yz, fx, fx * fz, fx * fy, fx * yz], 1)
-        w = basis @ TRILINEAR[:, :8 * J].to(x.device)  # (PL,8) to (PL,8J)
+        with torch.autocast(x.device.type, enabled=False):  # [D9] corners have float32 features
+            w = basis @ TRILINEAR[:, :8 * J].to(x.device)  # (PL,8) to (PL,8J)
         out = Interpolate.apply(self.features, corner.reshape(-1, 8), w.reshape(-1, J, 8))
         return out.reshape(P, L, J, self.features.shape[1])
 
@@ -442,7 +443,8 @@ def finite_differences(sdf, x: Tensor, eps: float, centre: Tensor | None = None)
     k = TETRAHEDRON.to(x.device) / math.sqrt(3)  # (4,3)
     taps = sdf((x[:, None] + eps * k).reshape(-1, 3)).reshape(-1, 4)  # (P,4)
     centre = sdf(x) if centre is None else centre  # (P,)
-    grad = 0.75 / eps * (taps @ k)  # (P,3); sum over taps of k k^T is 4/3 times the identity
+    slope = (taps[:, :, None] * k).sum(1)  # (P,3) not taps @ k: autocast would round the taps [D9]
+    grad = 0.75 / eps * slope  # (P,3); sum over taps of k k^T is 4/3 times the identity
     return grad, 6 / eps ** 2 * (taps.mean(1) - centre)  # (P,3), (P,)
 
 
