@@ -1998,13 +1998,6 @@ def test_mask_network_returns_half_the_resolution_in_any_shape():
     assert cgnet()(torch.rand(2, 3, 32, 48)).shape == (2, 1, 16, 24)
 
 
-def test_mask_network_is_the_same_in_training_and_evaluation_and_alone_or_in_a_batch():
-    net, photo = cgnet(), random(3, 3, 32, 32, dtype=torch.float32)
-    both = [net.train()(photo), net.eval()(photo)]
-    assert torch.equal(*both)
-    close(net(photo[1:2]), both[0][1:2], atol=1e-5)
-
-
 @pytest.mark.parametrize("seed", range(4))
 def test_mask_starts_small(seed):
     mask = torch.sigmoid(cgnet(seed)(random(4, 3, 48, 48, seed=seed, dtype=torch.float32)))
@@ -3664,3 +3657,407 @@ def test_deviations_listed_in_the_docstring_are_those_tagged_in_the_code():
     code = Path(g.__file__).read_text().replace(g.__doc__, "")
     listed = re.findall(r"^  \[(D\d+)\]", g.__doc__, re.M)
     assert len(listed) == len(set(listed)) and set(listed) == set(re.findall(r"\[(D\d+)\]", code))
+
+
+# ---- 14 where the predecessors fail --------------------------------------------------------------
+# One test per failure that users of the works behind this method report, named by its symptom. In
+# brackets: repository and issue, or the file that has it. A: Neuralangelo, P: Permuto-SDF, W:
+# NeuralRecon-W, I: instant-nsr-pl, C: CR-NeRF, H: Ha-NeRF.
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """A short training on a toy without passers-by, with every part of the model switched on, and its
+    photos rendered with the mean appearance code."""
+    arrays = toy(size=32, photos=12, test=3, occluders=0.0)
+    scene = g.load_scene(arrays, "cpu", 32)
+    run = tmp_path_factory.mktemp("trained")
+    model, *_ = run_training(
+        scene, run, rays=192, photos=6, samples=12, bg_samples=6, hidden=32, channels=4, steps=200,
+        lr_net=5e-3, lr_grid=2e-2, lr_zeta=1e-2, mask="on", appearance="on")
+    code = model.codes()[~scene.is_test].mean(0).detach()
+    photos = [*scene.photos(False)[::3].tolist(), *scene.photos(True).tolist()]
+    frames = {i: g.render_photo(model, scene, i, code) for i in photos}
+    return SimpleNamespace(model=model, scene=scene, log=last_log(run), arrays=arrays, frames=frames)
+
+
+def constant_sdf(model, value):
+    with torch.no_grad():
+        model.sdf.lin2.weight.zero_()
+        model.sdf.lin2.bias.fill_(value)
+    model.refresh_cache(0, 1)
+    return model
+
+
+def test_failure_01_no_nan_when_rays_miss_the_sphere(warm, scene):
+    """NaN in the first steps: root of a negative number, far < near (NeRF++ #10, A #102)."""
+    model, (rays, pick) = copy.deepcopy(warm), batch(scene)
+    o = torch.tensor([[0, 0, -3.0], [0, 5, 0], [0, 0, 0], [1, 0, 0], [0, 1, -3], [900, 0, 0]])
+    d = F.normalize(random(64, 3, low=-1, dtype=torch.float32), dim=1)
+    d[4::6] = torch.tensor([0.0, 0, 1])  # tangents
+    rays = rays._replace(o=o[torch.arange(64) % 6], d=d)
+    t0, t1, hit = g.sphere_interval(rays)
+    assert 0 < hit.sum() < 64 and (t1 >= t0).all() and (t0 >= rays.near).all()
+    total, logs = model.losses(rays, pick, 0.5, generator())
+    total.backward()
+    assert [k for k, v in logs.items() if not math.isfinite(v)] == []
+    assert all(torch.isfinite(p.grad).all() for p in model.parameters() if p.grad is not None)
+
+
+def test_failure_02_no_jump_and_no_nan_after_resuming(scene, tmp_path):
+    """NaN after a resume that lost part of the schedule, or late, out of the curvature (A #21, #22).
+    A model with a past takes the same step before and after its checkpoint."""
+    a, b = new_model(scene), new_model(scene, seed=1)
+    photos, gens, optimizers = scene.photos(False), [generator(7), generator(8)], []
+    a.step, a.refined = 777, 3
+    with torch.no_grad():
+        a.deviation.v.fill_(0.7)
+        for name in ("calibration", "level", "cache", "hits", "logits", "seen"):
+            buffer = getattr(a, name)
+            buffer.copy_(random(buffer.numel(), low=0.01).reshape(buffer.shape))
+    optimizers = [g.make_optimizer(m) for m in (a, b)]
+    state = dict(step=777)
+    g.training_step(a, optimizers[0], photos, state, 0.4, gens[0])  # gives Adam a past
+    g.save_checkpoint(tmp_path / "c.pt", a.cfg, a, optimizers[0], gens[0], state)
+    again = g.restore(g.read_checkpoint(tmp_path / "c.pt"), tmp_path / "c.pt", b, optimizers[1],
+                      gens[1])
+    steps = [g.training_step(m, opt, photos, s, 0.4, gen)  # by then, it has been refined thrice
+             for m, opt, s, gen in zip((a, b), optimizers, (state, again), gens)]
+    assert steps[0] == steps[1] and same_weights(a, b) and a.refined == b.refined == 3
+    assert steps[0][1] == 0 and all(math.isfinite(v) for v in steps[0][0].values())
+
+
+def test_failure_03_no_crash_when_all_is_empty(scene):
+    """"0 samples", all rays in empty cells (SuperNormal #10, P #14). The background is still seen
+    and still learns."""
+    model, (rays, pick) = constant_sdf(new_model(scene), 5.0), batch(scene)
+    away = rays._replace(o=5 * F.normalize(rays.o, dim=1), d=F.normalize(rays.o, dim=1))
+    for some in (rays, away):
+        model.zero_grad()
+        total, logs = model.losses(some, pick, 0.5, generator())
+        total.backward()
+        assert math.isfinite(total.item()) and float(logs["opacity"]) == 0
+        assert (model.background.color[2].weight.grad != 0).any()
+    assert float(logs["miss"]) == 1 and float(logs["eik"]) == 0
+
+
+def test_failure_04_ray_count_neither_explodes_nor_vanishes(warm):
+    """Rays per step adapted to the samples found: none or millions (P/train_permuto_sdf.py). Here
+    rays and samples of a step are constants, whether the scene is empty or solid."""
+    for value in (5.0, -5.0, 0.0):
+        model, gen, seen, asked = constant_sdf(copy.deepcopy(warm), value), generator(), [], []
+        optimizer, losses = g.make_optimizer(model), model.losses
+        model.losses = lambda rays, *more: (seen.append(len(rays.o)), losses(rays, *more))[1]
+        model.sdf.octree.register_forward_pre_hook(lambda _, args: asked.append(len(args[0])))
+        for step in range(1, 4):
+            g.training_step(model, optimizer, model.scene.photos(False), dict(step=step), 0.0, gen)
+        assert seen == [64] * 3 and asked.count(64 * 8) == 3
+        assert sum(asked) == 3 * 64 * (8 + 5 + 1)  # samples, taps and centre, half a point of a ball
+
+
+@pytest.mark.parametrize("how", ["analytic", "finite differences"])
+def test_failure_05_normals_are_no_noise_under_mixed_precision(warm, monkeypatch, how):
+    """Taps a few thousandths apart are equal in half precision (kaolin-wisp octree_grid.py)."""
+    x, eps = g.random_ball(500, generator()), 1 / 64
+
+    def derive(field, x):
+        if how == "analytic":
+            return field.with_gradient(x)[2]
+        return g.finite_differences(lambda y: field(y)[0], x, eps)[0]
+    with torch.no_grad():
+        full = derive(warm.sdf, x)
+        for kind in (torch.bfloat16, torch.float16):
+            with torch.autocast("cpu", kind):
+                assert torch.equal(derive(warm.sdf, x), full) and full.dtype == torch.float32
+        with monkeypatch.context() as patch:
+            patch.setattr(g, "TRILINEAR", g.TRILINEAR.double())
+            error = full - derive(copy.deepcopy(warm.sdf).double(), x.double())
+    assert error.norm(dim=1).max() < 1e-2 < full.norm(dim=1).min()
+
+
+@pytest.mark.parametrize("normals", ["analytic", "fd"])
+def test_failure_06_curvature_does_not_rise_as_eps_falls(warm, scene, normals):
+    """|lap| of a trilinear field sits on cell faces and grows as its step shrinks (A #172)."""
+    model, (rays, _) = copy.deepcopy(warm), batch(scene, 512, 8)
+    model.cfg = config(normals=normals, sampling="uniform")
+    with torch.no_grad():
+        model.sdf.octree.features[1:].normal_(0, 0.05)
+        cell, loss = 2 * model.eps, []
+        for model.eps in (cell, cell / 4, cell / 16):
+            loss.append(model.render(rays, model.codes()[rays.img])["e_curv"].mean().item())
+    lap = [v * k / cell for v, k in zip(loss, (1, 4, 16))]
+    assert lap[2] > 1.1 * lap[0]
+    assert loss[0] >= loss[1] >= loss[2] > 0
+
+
+def test_failure_07_sphere_does_not_stay_a_sphere(arrays, scene):
+    """zeta stuck, scene outside the sphere, wrong poses (NeuS #25, Factored-NeuS #1, P #17)."""
+    on = [arrays["points"][arrays["track_point"][arrays["track_photo"] == i]] for i in range(10)]
+    miss = []
+    for i, x in enumerate(on):
+        w, h = arrays["wh"][i]
+        uv, _ = data_prep.project(arrays["K"][i], arrays["c2w"][i], x.astype(float))
+        ok = ((uv > 0) & (uv < (w, h))).all(1)
+        pixel = torch.as_tensor(uv[ok].astype(int) @ (1, w))
+        rays = g.make_rays(scene, torch.full_like(pixel, i), pixel)
+        to_point = torch.as_tensor(x[ok]) - rays.o  # (P,3)
+        along = (to_point * rays.d).sum(1)  # (P,) negative behind the camera
+        angle = torch.atan2(torch.linalg.cross(to_point, rays.d).norm(dim=1), along)  # (P,)
+        miss.append(angle * arrays["K"][i, 0])
+    assert torch.cat(miss).median() < 2  # px
+    assert json.loads(str(arrays["info"]))["reprojection_px"] < 2
+    assert (scene.points.norm(dim=1) < 1).float().mean() > 0.8
+    (rays, *_), model = ball_rays(), ball_model()
+    zero, jitter = torch.zeros(40, 0), torch.full((40, 52), 0.5)
+    sharp, model.deviation = g.render_rays(model, rays, zero, jitter)["rgb"], g.Deviation()
+    (g.render_rays(model, rays, zero, jitter)["rgb"] - sharp).abs().mean().backward()
+    assert model.deviation.v.grad < 0  # a surface in its place gets sharper
+
+
+def test_failure_08_no_shell_around_the_scene(trained):
+    """A cube or shell with the sky painted on it (A #129, I #17, #55, #56)."""
+    x = g.random_ball(4000, generator())
+    world_x = x.numpy() * trained.scene.raw["scale"] + trained.scene.raw["center"]
+    true = torch.as_tensor(data_prep.toy_sdf(world_x) / trained.scene.raw["scale"])
+    with torch.no_grad():
+        s = trained.model.sdf(x)[0]
+    free, shell = true > 0.1, x.norm(dim=1) > 0.8
+    assert free.sum() > 1000 < (free & shell).sum() + 900
+    assert (s[free] < 0).float().mean() < 0.05 > (s[free & shell] < 0).float().mean()
+
+
+def test_failure_09_background_does_not_paint_everything(trained):
+    """The foreground stays empty as the background reaches into the sphere (I #40, #78)."""
+    model, scene, seen = trained.model, trained.scene, []
+    hook = model.background.octree.register_forward_pre_hook(lambda _, args: seen.append(args[0]))
+    rays, _ = batch(scene, 192, 6)
+    with torch.no_grad():
+        hit = model.render(rays, model.codes()[rays.img])["hit"]
+    hook.remove()
+    x = seen[0].reshape(192, -1, 3)[hit]
+    assert hit.sum() > 50 and x.norm(dim=2).min() > 1 - 1e-4
+    opacity = []
+    for i in scene.photos(False)[::3].tolist():
+        pixel = torch.arange(int(scene.wh[i].prod()))
+        rays = g.make_rays(scene, torch.full_like(pixel, i), pixel)
+        depth = torch.as_tensor(photo(trained.arrays, i, "depth").reshape(-1, 1)).float()
+        on = (rays.at(depth)[:, 0].norm(dim=1) < 0.9) & depth[:, 0].isfinite()
+        opacity.append(torch.as_tensor(trained.frames[i]["opacity"]).flatten()[on])
+    assert torch.cat(opacity).median() > 0.9
+    assert 0 < trained.log["opacity"] < 1  # its mean is logged
+
+
+def test_failure_10_no_billboard_in_front_of_a_camera(trained):
+    """Each photo grows its own billboard where no other looks (P/SphereGPU.cuh, I #20)."""
+    model, scene, seen = trained.model, trained.scene, []
+    hook = model.sdf.register_forward_pre_hook(lambda _, args: seen.append(args[0]))
+    sdf, model.sdf.with_gradient = model.sdf.with_gradient, \
+        lambda x: (seen.append(x), sdf(x))[1]
+    rays, _ = batch(scene, 192, 6)
+    rays = rays._replace(o=0.3 * rays.o, near=torch.full((192,), 0.5))  # inside the sphere
+    with torch.no_grad():
+        model.render(rays, model.codes()[rays.img])
+    hook.remove()
+    del model.sdf.with_gradient
+    x = seen[0].reshape(192, -1, 3)
+    assert (x - rays.o[:, None]).norm(dim=2).min() >= 0.5
+    scores = {True: [], False: []}
+    for i, frame in trained.frames.items():
+        value = g.psnr(g.to_uint8(frame["rgb"]), g.to_uint8(frame["truth"]))
+        scores[scene.is_test[i].item()].append(value)
+    assert abs(np.mean(scores[True]) - np.mean(scores[False])) < 3
+
+
+def test_failure_11_no_collapse_around_a_wrong_surface():
+    """Worse with more training: all samples sit where the surface was once thought to be (W #53)."""
+    (rays, depth, disc), model = ball_rays(80), ball_model()
+    t0, t1, _ = g.sphere_interval(rays)
+    model.cache = model.cache.flip(2, 3, 4)  # the ball is believed to be on the other side
+    edges = g.sample_sections(model, rays, t0, t1, 48, torch.full((80, 48), 0.5))
+    assert (edges.diff(dim=1).max(1)[0] <= (t1 - t0) / (g.FLOOR * 47) * 1.01 + 1e-6).all()
+    out = g.render_rays(model, rays, torch.zeros(80, 0), torch.full((80, 52), 0.5))
+    hit = disc > 0.04
+    assert hit.sum() > 10 and (out["opacity"][hit] > 0.9).all()
+    close(out["depth"][hit], depth[hit], atol=0.1, rtol=0)
+
+
+def test_failure_12_mask_does_not_eat_the_static_scene(trained):
+    """Everything hard to fit is called transient, with weights made for squared errors (C, H
+    losses.py; nerf-on-the-go #5, wild-gaussians #23). Nothing moves in this scene."""
+    assert trained.model.use_mask
+    assert max(frame["mask"].mean() for frame in trained.frames.values()) < 0.05
+    assert trained.model.logits.sigmoid().mean() < 0.05
+
+
+@pytest.mark.parametrize("start", [-4.0, 0.0, 4.0])
+def test_failure_13_mask_is_not_stuck(warm, start):
+    """Stuck at 1/2 before the pole of the bimodality term, or frozen at 0 or 1 (H #30). Plain
+    gradient descent on free pixels: errors of 0.3 end masked and of 0.02 not, from any start."""
+    model, pick = tuned(warm), torch.tensor([0])
+    model.cgnet = FreeLogits((1, 1, 16, 16))
+    model.cgnet.logits.data.fill_(start)
+    model.level.fill_(0.02)
+    model.seen[0] = 0.0
+    model.seen[0, 0, 8:] = 0.3
+    for _ in range(400):
+        model.mask_objective(pick).backward()
+        with torch.no_grad():
+            model.cgnet.logits -= 256 * model.cgnet.logits.grad  # the objective is a mean over 256
+        model.cgnet.logits.grad = None
+    mask = torch.sigmoid(model.cgnet.logits[0, 0])
+    assert (mask[10:] > 0.9).all() and (mask[:6] < 0.1).all()
+
+
+def test_failure_14_mask_is_the_same_in_training_and_evaluation():
+    """BatchNorm with one photo a step: other masks in evaluation (C models/lightweight_seg.py)."""
+    net, photo = cgnet(), random(3, 3, 32, 32, dtype=torch.float32)
+    both = [net.train()(photo), net.eval()(photo)]
+    assert torch.equal(*both)
+    close(net(photo[1:2]), both[0][1:2], atol=1e-5)
+
+
+@pytest.mark.parametrize("eps", [1e-3, 1e-5, 1e-7])
+def test_failure_15_no_spikes_at_cell_borders(double, eps):
+    """A tap that leaves the refined cells reads zeros: a spike of height 1 / eps (kaolin-wisp
+    octree_grid.py). Here slopes across every border are those of the cells on its two sides."""
+    octree = make_tree()
+    fill(octree)
+    face = []
+    for level in range(1, octree.levels):
+        x = octree.centres(level).double()
+        inside = random(len(x), 3, low=-0.4, high=0.4) * octree.cell(level)
+        for axis in range(3):
+            inside[:, axis] = octree.cell(level) / 2
+            face.append(x + inside)
+    x = torch.cat(face)
+    x = x[(x.abs() < octree.half - 2 * eps).all(1)]
+    with torch.no_grad():
+        grad, _ = g.finite_differences(lambda y: octree(y).sum((1, 2, 3)), x, eps)
+        steepest = 2 * octree.features.abs().max() * sum(
+            2 / octree.cell(level) for level in range(octree.levels))  # two channels, per axis
+    assert len(x) > 1000 and grad.norm(dim=1).max() <= 3 * steepest
+
+
+def test_failure_16_a_lost_surface_returns(monkeypatch):
+    """Cells pruned where the surface was not are never looked at again (P/sdf_utils.py). A ball that
+    moves by three cells is found by samples and by the octree."""
+    shift, model, tree = torch.tensor([0.375, 0, 0]), ball_model(), refinable()
+    g.GeoNVS.refine(tree, tree.optimizer)  # prunes around the old place
+    monkeypatch.setitem(globals(), "CENTRE", CENTRE + shift)
+    model.refresh_cache = functools.partial(g.GeoNVS.refresh_cache, model)
+    model.refined = len(g.REFINE_AT)
+    for step in range(64):
+        g.GeoNVS.maintain(model, step, 0.0, None)
+    rays, depth, disc = ball_rays(80)
+    t0, t1, _ = g.sphere_interval(rays)
+    edges = g.sample_sections(model, rays, t0, t1, 32, torch.full((80, 32), 0.5))[:, 1:-1]
+    near = ((edges - depth[:, None]).abs() < 0.15).float().mean(1)[disc > 0.02]
+    assert len(near) > 20 and near.min() > 0.6
+    at = hit_the_ball(tree, 5, 0.5, (1.0, 0.2, 0.1))
+    assert (tree.sdf.octree.locate(at)[0][0, 2] == 0).any()  # not fine there
+    for _ in range(2):
+        g.GeoNVS.refine(tree, tree.optimizer)
+    assert (tree.sdf.octree.locate(at)[0] > 0).all()
+
+
+@pytest.fixture(scope="module")
+def exposures(scene, tmp_path_factory):
+    """Trained on photos that differ in nothing but exposure: each is one grey, dark or bright."""
+    grey = torch.where(torch.arange(len(scene.wh)) % 2 == 0, 64, 191).to(torch.uint8)
+    rgb = grey.repeat_interleave(scene.start.diff())[:, None].expand(-1, 3).contiguous()
+    flat = scene._replace(rgb=rgb)
+    model, *_ = run_training(flat, tmp_path_factory.mktemp("exposures"), steps=200, rays=96,
+                             appearance="on", background="on", mask="off", lr_net=2e-2)
+    return SimpleNamespace(model=model, scene=flat, grey=grey.float() / 255)
+
+
+def test_failure_17_exposure_needs_no_floaters(exposures):
+    """Colour changes are explained by floaters where codes reach not all parts (CityGaussian #43):
+    both foreground and background follow the exposure."""
+    model, scene = exposures.model, exposures.scene
+    rays, _ = batch(scene, 512, 8)
+    with torch.no_grad():
+        out = model.render(rays, model.codes()[rays.img])
+    miss, want = ~out["hit"], exposures.grey[rays.img][:, None].expand(-1, 3)
+    solid = out["opacity"] > 0.5
+    assert miss.sum() > 20 < solid.sum()
+    for part in (miss, solid):
+        assert (out["rgb"] - want)[part].abs().mean() < 0.06
+
+
+def test_failure_18_unseen_photos_get_the_right_code(exposures):
+    """Codes memorise the training photos, a test photo gets another one's (Octree-AnyGS #8,
+    Scaffold-GS #38, splatfacto-w #16): fitted on the left, it must serve the right half."""
+    model, scene = exposures.model, exposures.scene
+    photos = scene.photos(True)
+    assert exposures.grey[photos].unique().numel() == 2
+    mean, fitted = (g.fit_codes(model, scene, photos, None, n, "half", 32) for n in (0, 60))
+    error = []
+    for i, *codes in zip(photos.tolist(), mean, fitted):
+        right = g.half_pixels(scene, i, False)
+        rays = g.make_rays(scene, torch.full_like(right, i), right)
+        for code in codes:
+            with torch.no_grad():
+                rgb = model.render(rays, code.expand(len(right), -1))["rgb"]
+            error.append((rgb - rays.rgb).abs().mean().item())
+    assert max(error[1::2]) < 0.06 < min(error[::2])
+
+
+def test_failure_19_the_metric_is_the_one_it_names(scene):
+    """Window 3 or 11, whole or half photo, masked or not (NeuS #34, GS-W #6, C #3)."""
+    truth = random(24, 40, 3).numpy()
+    frame = dict(rgb=(truth + 0.1 * random(24, 40, 3, seed=1).numpy()).clip(0, 1), truth=truth,
+                 mask=np.ones((24, 40)))
+    row, half = g.score(frame, None, "cpu"), [g.to_uint8(frame[k])[:, 20:] for k in ("rgb", "truth")]
+    assert row["ssim"] == pytest.approx(naive_ssim(*half), abs=1e-4)
+    mse = ((half[0].astype(float) - half[1]) ** 2).mean()
+    assert row["psnr"] == pytest.approx(10 * math.log10(255 ** 2 / mse))
+    frame["rgb"][:, :20] = 0  # the left half, and what the mask thinks, do not count
+    assert g.score(frame | dict(mask=frame["mask"] * 0), None, "cpu")["psnr"] == row["psnr"]
+
+
+def test_failure_20_split_is_joined_by_name(tmp_path, source):
+    """Labels shift when rows are taken by position (C datasets: names without a pose are skipped,
+    the table is not). Shuffled rows, stale numbers, names that only one side knows."""
+    as_colmap(tmp_path / "place", source)
+    table = tmp_path / "place" / "toy.tsv"
+    head, *rows = table.read_text().splitlines()
+    rows = [f"{9 - i}.0\t{row.split(chr(9), 1)[1]}" for i, row in enumerate(rows)]
+    rows = ["77.0\ttest\ta_ghost.jpg\ttoy", *rows[::-1][1:], "\ttest\ttoy_000.png\ttoy"]
+    table.write_text("\n".join([head, *rows]) + "\n")  # the last photo has no row any more
+    made = data_prep.prepare(tmp_path / "place", 1)
+    want = dict(zip(source["name"][:-1].tolist(), source["is_test"][:-1].tolist()))
+    assert dict(zip(made["name"].tolist(), made["is_test"].tolist())) == want
+    for i, name in enumerate(made["name"]):  # and each name kept its own picture
+        assert np.array_equal(photo(made, i), photo(source, source["name"].tolist().index(name)))
+
+
+def test_failure_21_lipschitz_loss_does_not_dominate(warm, scene):
+    """The product of the bounds starts above the colour loss (P/models.py). At P's layer sizes."""
+    model = copy.deepcopy(warm)
+    inputs = model.color.layers[0].in_features
+    model.color = g.LipschitzMLP([inputs, 128, 128, 64, 3])
+    _, raw = model.losses(*batch(scene), 0.0, generator())
+    assert 0 < g.Config().lam_lps * raw["lps"] < 0.1 * raw["rgb"]
+
+
+@pytest.mark.parametrize("normals, more", [("analytic", lambda n: n + 5), ("fd", lambda n: 5 * n)])
+@pytest.mark.parametrize("samples", [4, 12])
+def test_failure_22_derivatives_cost_no_more_than_their_taps(warm, scene, normals, more, samples):
+    """4 to 7 times the evaluations (sdfstudio #247, #140): four taps share the sample's own value,
+    closed-form normals need none, and placing samples asks the network nothing."""
+    model, asked = copy.deepcopy(warm), []
+    model.cfg, (rays, _) = config(normals=normals, samples=samples), batch(scene)
+    model.sdf.octree.register_forward_pre_hook(lambda _, args: asked.append(len(args[0])))
+    model.render(rays, model.codes()[rays.img])
+    assert sum(asked) == 64 * more(samples)
+
+
+def test_failure_23_the_grid_does_not_ignore_the_first_sphere(scene):
+    """Random features outweigh xyz, or cells are missing where the sphere is (I #22)."""
+    model = new_model(scene, hidden=64, levels=3, channels=4)
+    model.start(generator())
+    with torch.no_grad():
+        x = g.random_ball(4000, generator(5))
+        error = model.sdf(x)[0] - (x.norm(dim=1) - 0.25)
+    assert error.square().mean().sqrt() < model.eps / 2  # a quarter of the finest cell
