@@ -3667,8 +3667,8 @@ def test_deviations_listed_in_the_docstring_are_those_tagged_in_the_code():
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
-    """A short training on a toy without passers-by, with every part of the model switched on, and its
-    photos rendered with the mean appearance code."""
+    """A short training on a toy without passers-by, with every part of the model switched on, and
+    some of its photos rendered with the mean appearance code."""
     arrays = toy(size=32, photos=12, test=3, occluders=0.0)
     scene = g.load_scene(arrays, "cpu", 32)
     run = tmp_path_factory.mktemp("trained")
@@ -3678,7 +3678,8 @@ def trained(tmp_path_factory):
     code = model.codes()[~scene.is_test].mean(0).detach()
     photos = [*scene.photos(False)[::3].tolist(), *scene.photos(True).tolist()]
     frames = {i: g.render_photo(model, scene, i, code) for i in photos}
-    return SimpleNamespace(model=model, scene=scene, log=last_log(run), arrays=arrays, frames=frames)
+    return SimpleNamespace(model=model, scene=scene, arrays=arrays, frames=frames,
+                           log=last_log(run))
 
 
 def constant_sdf(model, value):
@@ -3697,7 +3698,7 @@ def test_failure_01_no_nan_when_rays_miss_the_sphere(warm, scene):
     d[4::6] = torch.tensor([0.0, 0, 1])  # tangents
     rays = rays._replace(o=o[torch.arange(64) % 6], d=d)
     t0, t1, hit = g.sphere_interval(rays)
-    assert 0 < hit.sum() < 64 and (t1 >= t0).all() and (t0 >= rays.near).all()
+    assert 0 < hit.sum() < 64 and torch.equal(hit, t1 > t0) and (t0 >= rays.near).all()
     total, logs = model.losses(rays, pick, 0.5, generator())
     total.backward()
     assert [k for k, v in logs.items() if not math.isfinite(v)] == []
@@ -3705,8 +3706,8 @@ def test_failure_01_no_nan_when_rays_miss_the_sphere(warm, scene):
 
 
 def test_failure_02_no_jump_and_no_nan_after_resuming(scene, tmp_path):
-    """NaN after a resume that lost part of the schedule, or late, out of the curvature (A #21, #22).
-    A model with a past takes the same step before and after its checkpoint."""
+    """NaN after a resume that lost part of the schedule, or late, out of the curvature (A #21,
+    #22). A model with a past takes the same step before and after its checkpoint."""
     a, b = new_model(scene), new_model(scene, seed=1)
     photos, gens, optimizers = scene.photos(False), [generator(7), generator(8)], []
     a.step, a.refined = 777, 3
@@ -3752,7 +3753,7 @@ def test_failure_04_ray_count_neither_explodes_nor_vanishes(warm):
         for step in range(1, 4):
             g.training_step(model, optimizer, model.scene.photos(False), dict(step=step), 0.0, gen)
         assert seen == [64] * 3 and asked.count(64 * 8) == 3
-        assert sum(asked) == 3 * 64 * (8 + 5 + 1)  # samples, taps and centre, half a point of a ball
+        assert sum(asked) == 3 * 64 * (8 + 5 + 1)  # samples, taps and centre, losses
 
 
 @pytest.mark.parametrize("how", ["analytic", "finite differences"])
@@ -3869,7 +3870,7 @@ def test_failure_10_no_billboard_in_front_of_a_camera(trained):
 
 
 def test_failure_11_no_collapse_around_a_wrong_surface():
-    """Worse with more training: all samples sit where the surface was once thought to be (W #53)."""
+    """Worse with more training: samples sit where the surface was once thought to be (W #53)."""
     (rays, depth, disc), model = ball_rays(80), ball_model()
     t0, t1, _ = g.sphere_interval(rays)
     model.cache = model.cache.flip(2, 3, 4)  # the ball is believed to be on the other side
@@ -3939,8 +3940,8 @@ def test_failure_15_no_spikes_at_cell_borders(double, eps):
 
 
 def test_failure_16_a_lost_surface_returns(monkeypatch):
-    """Cells pruned where the surface was not are never looked at again (P/sdf_utils.py). A ball that
-    moves by three cells is found by samples and by the octree."""
+    """Cells pruned where the surface was not are never looked at again (P/sdf_utils.py). A ball
+    that moves by three cells is found by samples and by the octree."""
     shift, model, tree = torch.tensor([0.375, 0, 0]), ball_model(), refinable()
     g.GeoNVS.refine(tree, tree.optimizer)  # prunes around the old place
     monkeypatch.setitem(globals(), "CENTRE", CENTRE + shift)
@@ -3973,16 +3974,19 @@ def exposures(scene, tmp_path_factory):
 
 def test_failure_17_exposure_needs_no_floaters(exposures):
     """Colour changes are explained by floaters where codes reach not all parts (CityGaussian #43):
-    both foreground and background follow the exposure."""
-    model, scene = exposures.model, exposures.scene
+    seen from the same place, foreground and background both follow the code."""
+    model, scene, train = exposures.model, exposures.scene, ~exposures.scene.is_test
     rays, _ = batch(scene, 512, 8)
-    with torch.no_grad():
-        out = model.render(rays, model.codes()[rays.img])
-    miss, want = ~out["hit"], exposures.grey[rays.img][:, None].expand(-1, 3)
-    solid = out["opacity"] > 0.5
+    seen = {}
+    for grey in exposures.grey.unique().tolist():
+        code = model.codes()[train & (exposures.grey == grey)].mean(0)
+        with torch.no_grad():
+            seen[grey] = model.render(rays, code.expand(512, -1))
+    miss, solid = ~seen[grey]["hit"], seen[grey]["opacity"] > 0.5
     assert miss.sum() > 20 < solid.sum()
-    for part in (miss, solid):
-        assert (out["rgb"] - want)[part].abs().mean() < 0.06
+    for grey, out in seen.items():
+        for part in (miss, solid):
+            assert (out["rgb"][part] - grey).abs().mean() < 0.1
 
 
 def test_failure_18_unseen_photos_get_the_right_code(exposures):
@@ -4008,7 +4012,8 @@ def test_failure_19_the_metric_is_the_one_it_names(scene):
     truth = random(24, 40, 3).numpy()
     frame = dict(rgb=(truth + 0.1 * random(24, 40, 3, seed=1).numpy()).clip(0, 1), truth=truth,
                  mask=np.ones((24, 40)))
-    row, half = g.score(frame, None, "cpu"), [g.to_uint8(frame[k])[:, 20:] for k in ("rgb", "truth")]
+    half = [g.to_uint8(frame[k])[:, 20:] for k in ("rgb", "truth")]
+    row = g.score(frame, None, "cpu")
     assert row["ssim"] == pytest.approx(naive_ssim(*half), abs=1e-4)
     mse = ((half[0].astype(float) - half[1]) ** 2).mean()
     assert row["psnr"] == pytest.approx(10 * math.log10(255 ** 2 / mse))
