@@ -464,12 +464,13 @@ class LipschitzMLP(nn.Module):
         self.c = nn.Parameter(torch.log(torch.expm1(2 * bound)))  # (layers,)
 
     def bounds(self) -> Tensor:
-        """Lipschitz bound of each layer in the max norm."""
-        return F.softplus(self.c)
+        """Lipschitz bound of each layer in the max norm; above 0, as the loss takes its log."""
+        return F.softplus(self.c).clamp(min=1e-6)
 
     def forward(self, x: Tensor) -> Tensor:
         for i, (layer, bound) in enumerate(zip(self.layers, self.bounds())):
-            scale = (bound / layer.weight.abs().sum(1)).clamp(max=1)  # (out,)
+            norm = layer.weight.abs().sum(1).clamp(min=1e-9)  # (out,)
+            scale = (bound / norm).clamp(max=1)  # (out,)
             x = F.relu(x) if i else x
             x = F.linear(x, layer.weight * scale[:, None], layer.bias)  # (P,out)
         return x
