@@ -1381,6 +1381,17 @@ def test_points_outside_the_cube_get_the_nearest_features_inside(far):
     assert torch.equal(octree(x), octree(edge)) and torch.isfinite(octree(-x)).all()
 
 
+@pytest.mark.parametrize("levels, root", [(1, 1), (3, 1), (5, 2)])
+def test_one_cell_and_empty_levels_give_finite_features_and_gradients(levels, root):
+    octree = g.Octree(1.0, levels, 2, root=root)  # nothing is split
+    x = torch.tensor([[0.0, 0, 0], [1, 1, 1], [-1, 0.5, 1], [1e4, -1e4, 0], [1e30, 0, -1e30]])
+    out = octree(x, derivatives=True)
+    out.square().sum().backward()
+    assert out.shape == (5, levels, 4, 2) and len(octree(x[:0])) == 0
+    assert torch.isfinite(out).all() and torch.isfinite(octree.features.grad).all()
+    assert (out[:, 1:] == 0).all() and len(octree.features) - 1 == (root + 1) ** 3
+
+
 def test_trilinear_weights_sum_to_one_and_their_derivatives_to_zero():
     f = random(20, 3)
     basis = torch.stack([f[:, 0] ** i * f[:, 1] ** j * f[:, 2] ** k
@@ -1509,6 +1520,23 @@ def test_taps_are_unit_steps_and_a_given_centre_saves_its_evaluation():
     close((calls[0].reshape(5, 4, 3) - x[:, None]).norm(dim=2), torch.full((5, 4), 0.5))
 
 
+@pytest.mark.parametrize("scale", [0.0, 1e-4, 1.0, 1e4])
+@pytest.mark.parametrize("eps", [1e-4, 1e-2, 1e3])
+def test_derivatives_and_their_gradients_are_finite_at_any_size(scale, eps):
+    field = g.SDFField(g.Octree(1.0, 2, 2), 8)
+    with torch.no_grad():
+        field.octree.features.mul_(scale)
+        field.lin2.weight.mul_(scale)
+        field.lin2.bias.fill_(scale)
+    x = torch.tensor([[0.0, 0, 0], [1, 1, 1], [0.125, 0.3, -0.125], [1e3, 0, 1]]).requires_grad_()
+    s, _, grad = field.with_gradient(x)
+    taps, lap = g.finite_differences(lambda y: field(y)[0], x, eps)
+    (s.sum() + (grad.norm(dim=1) - 1).square().sum() + F.normalize(grad, dim=1).sum()
+     + F.normalize(taps, dim=1).sum() + lap.abs().sum() * eps).backward()
+    assert all(torch.isfinite(v).all() for v in (s, grad, taps, lap, x.grad))
+    assert all(torch.isfinite(p.grad).all() for p in field.parameters())
+
+
 def test_spherical_harmonics_are_orthogonal_on_the_sphere():
     z, wz = np.polynomial.legendre.leggauss(8)
     phi = np.arange(16) * 2 * np.pi / 16
@@ -1569,6 +1597,30 @@ def test_contract_is_identity_inside_below_two_outside_continuous_and_monotone()
     close(n[:, 4:], (2 - 1 / r[4:, 0]).expand(50, 4))
     assert (n < 2).all() and (n.diff(dim=1) > 0).all() and (n[:, 4] - n[:, 2] < 1e-5).all()
     close(F.cosine_similarity(y[:, 1:], d.expand(50, 7, 3), dim=2), torch.ones(50, 7))
+
+
+@pytest.mark.parametrize("c", [-1e4, -100.0, 0.0, 1e4])
+@pytest.mark.parametrize("weight", [0.0, 1e-20, 1.0, 1e4])
+def test_lipschitz_bound_and_its_gradients_are_finite(c, weight):
+    net = g.LipschitzMLP([3, 4, 4, 2])
+    with torch.no_grad():
+        net.c.fill_(c)
+        for layer in net.layers:
+            layer.weight.mul_(weight)
+            layer.weight[0] = 0
+    loss = net(random(5, 3, dtype=torch.float32)).sum() + torch.log(net.bounds()).sum()
+    loss.backward()
+    assert math.isfinite(loss.item())
+    assert all(torch.isfinite(p.grad).all() for p in net.parameters())
+
+
+def test_contraction_and_its_gradient_are_finite():
+    r = torch.tensor([0, 1e-30, 1e-3, 1 - 1e-6, 1, 1 + 1e-6, 30, 1e4, 1e15])
+    x = torch.cat([F.pad(r[:, None], (0, 2)), r[:, None] * torch.tensor([0.6, 0, -0.8])])
+    x.requires_grad_()
+    out = g.contract(x)
+    out.sum().backward()
+    assert (out.norm(dim=1) <= 2).all() and torch.isfinite(x.grad).all()
 
 
 class Recorder(nn.Module):
@@ -1737,6 +1789,13 @@ def test_alpha_and_its_gradients_are_finite_for_all_magnitudes():
     assert all(torch.isfinite(v).all() for v in grads)
 
 
+def test_printed_alpha_and_its_gradients_are_finite_for_all_magnitudes():
+    zeta, s, cos, dt = (c[None].clone().requires_grad_() for c in GRID.T)
+    alpha = g.printed_alpha(s, cos, dt, zeta)
+    grads = torch.autograd.grad(alpha.sum(), (s, cos, dt, zeta))
+    assert (alpha.abs() <= 1).all() and all(torch.isfinite(v).all() for v in grads)
+
+
 @pytest.mark.parametrize("k", [1e-2, 0.5, 7.0])
 def test_alpha_does_not_change_when_space_is_scaled_and_zeta_with_it(k):
     s, cos, dt = random(9, 9, low=-0.3, high=0.3), random(9, 9, seed=1, low=-1), random(9, 9, seed=2)
@@ -1769,6 +1828,16 @@ def test_weights_and_what_passes_sum_to_one_with_finite_gradients(alpha):
     assert (w.sum() + trans).item() == pytest.approx(1, abs=3e-6)
     grad, = torch.autograd.grad((w * torch.tensor([1.0, 2, 3])).sum() + 5 * trans.sum(), alpha)
     assert torch.isfinite(grad).all()
+
+
+@pytest.mark.parametrize("n", [1, 2, 10_000])
+@pytest.mark.parametrize("value", [0.0, 1e-12, 1e-4, 0.999, 1.0])
+def test_compositing_one_or_many_sections_is_finite(n, value):
+    alpha = torch.full((1, n), value).requires_grad_()
+    w, trans = g.composite(alpha)
+    ((w * torch.arange(1.0, n + 1)).sum() + trans.sum()).backward()
+    assert (w >= 0).all() and (w.sum() + trans).item() == pytest.approx(1, abs=1e-3)
+    assert torch.isfinite(alpha.grad).all()
 
 
 def test_an_opaque_section_hides_all_behind_it():
@@ -2079,6 +2148,32 @@ def test_calibration_of_equal_signals_keeps_a_positive_width():
     close(calibration, [0.7, 1e-3], rtol=1e-3)
 
 
+@pytest.mark.parametrize("x", [[0.0], [0.3], [0.7] * 9, [0.0, 1e30], [1e-30, 1e-30, 5.0],
+                               [math.inf, 0.2, math.nan]])
+def test_calibration_and_edges_are_finite(x):
+    """Of one ray, of equal rays, and beyond anything that a field can produce."""
+    x, calibration = torch.tensor(x), torch.tensor([0.0, 1.0])
+    for _ in range(300):
+        g.calibrate(x, calibration)
+    edge = g.edge_indicator(x, x, 10.0, 2.0, calibration)[x.isfinite()]
+    assert torch.isfinite(calibration).all() and calibration[1] >= 1e-3
+    assert ((edge >= 0) & (edge <= 1)).all()
+
+
+@pytest.mark.parametrize("logit", [-1e4, -100.0, 0.0, 100.0, 1e4])
+@pytest.mark.parametrize("seen", [-1.0, 0.0, 0.2, 1.0])
+def test_mask_losses_and_gradients_are_finite(warm, logit, seen):
+    """Nothing seen yet, no error, usual and largest errors; masks all off, unsure, all on."""
+    model = copy.deepcopy(warm)
+    model.seen.fill_(seen)
+    model.cgnet = FreeLogits((1, 1, 16, 16))
+    model.cgnet.logits.data.fill_(logit)
+    mask = g.mask_at(model.cgnet.logits, random(9, 2, dtype=torch.float32))
+    loss = model.mask_objective(torch.tensor([0])) + g.gpl_loss(mask, mask) + g.bimodality(mask)
+    loss.backward()
+    assert math.isfinite(loss.item()) and torch.isfinite(model.cgnet.logits.grad).all()
+
+
 # ---- 7 model and objective -----------------------------------------------------------------------------
 
 def test_random_ball_is_uniform():
@@ -2135,6 +2230,84 @@ def test_every_loss_and_gradient_is_finite(warm, scene, changes):
     total.backward()
     assert all(math.isfinite(float(v)) for v in (total.detach(), *logs.values()))
     assert all(torch.isfinite(p.grad).all() for p in model.parameters() if p.grad is not None)
+
+
+@pytest.mark.parametrize("normals", ["analytic", "fd"])
+@pytest.mark.parametrize("kind", [torch.bfloat16, torch.float16])
+def test_mixed_precision_changes_the_losses_little_and_nothing_to_nan(warm, scene, kind, normals):
+    (rays, pick), found = batch(scene), []
+    for use_amp in (False, True):
+        model = copy.deepcopy(warm)
+        model.cfg = config(normals=normals)
+        with torch.autocast("cpu", kind, enabled=use_amp):
+            total, logs = model.losses(rays, pick, 0.5, generator())
+        total.backward()
+        assert all(torch.isfinite(p.grad).all() for p in model.parameters() if p.grad is not None)
+        found.append(logs | dict(total=total))
+    close(*(f["total"] for f in found), rtol=0.05)
+    close(*(f["rgb"] for f in found), rtol=0.05)
+    assert all(found[0][k] == found[1][k] for k in "eik curv off sfm opacity".split())  # [D9]
+
+
+def constant_sdf(model, value):
+    with torch.no_grad():
+        model.sdf.lin2.weight.zero_()
+        model.sdf.lin2.bias.fill_(value)
+    model.refresh_cache(0, 1)
+    return model
+
+
+def losses_are_finite(model, rays, pick):
+    model.zero_grad()
+    total, logs = model.losses(rays, pick, 0.5, generator())
+    total.backward()
+    grads = [p.grad for p in model.parameters() if p.grad is not None]
+    return all(torch.isfinite(v).all() for v in (total, *logs.values(), *grads))
+
+
+@pytest.mark.parametrize("normals", ["analytic", "fd"])
+@pytest.mark.parametrize("zeta", [1e-2, 1e5])
+@pytest.mark.parametrize("value", [-1e4, -1e-4, 0.0, 1e4])
+def test_a_constant_sdf_has_finite_losses_at_any_sharpness(warm, scene, value, zeta, normals):
+    model = constant_sdf(copy.deepcopy(warm), value)
+    model.cfg, model.deviation = config(normals=normals), g.Deviation(zeta)
+    assert losses_are_finite(model, *batch(scene))
+
+
+@pytest.mark.parametrize("logit", [-1e4, 1e4])
+def test_a_batch_that_is_all_masked_or_not_at_all_has_finite_losses(warm, scene, logit):
+    model = copy.deepcopy(warm)
+    model.logits.fill_(logit)
+    model.step = 1  # no new opinion in this step
+    assert losses_are_finite(model, *batch(scene))
+    _, logs = model.losses(*batch(scene), 0.5, generator())
+    assert float(logs["mask"]) == (logit > 0) and (float(logs["rgb"]) > 0) == (logit < 0)
+
+
+def test_one_photo_and_the_smallest_batch_train(arrays):
+    """One photo, one ray to look at, the two rays that --rays asks for at least."""
+    n = int(arrays["start"][1])
+    one = {k: arrays[k][:1] for k in ("wh", "K", "c2w", "near", "name")}
+    one |= dict(rgb=arrays["rgb"][:n], start=arrays["start"][:2], is_test=np.zeros(1, bool))
+    scene = g.load_scene(arrays | one, "cpu", 32)
+    model = new_model(scene, photos=1, rays=2)
+    rays, pick = model.batch(scene.photos(False), generator())
+    assert len(rays.o) == 2 and losses_are_finite(model, rays, pick)
+    out = model.render(g.Rays(*[v[:1] for v in rays]), model.codes()[:1])
+    assert all(torch.isfinite(v).all() for v in out.values())
+
+
+@pytest.mark.parametrize("value", [0, 127, 255])
+def test_photos_of_one_colour_are_a_scene(arrays, value):
+    """All black, all grey, all white: statistics, losses and scores are finite."""
+    flat = data_prep.statistics(arrays | dict(rgb=np.full_like(arrays["rgb"], value)))
+    scene = g.load_scene(flat, "cpu", 32)
+    assert flat["exposure_spread"] == 0 and 0 < flat["footprint"] < math.inf
+    close(flat["bg_color"], [value / 255] * 3)
+    model = new_model(scene, mask="on")
+    assert losses_are_finite(model, *batch(scene))
+    rows = g.evaluate(model, scene, model.cfg, None)["per_image"]
+    assert all(math.isfinite(row[k]) for row in rows for k in ("psnr", "ssim", "psnr_floor"))
 
 
 def tuned(warm, logit=0.5, **changes):
@@ -2631,6 +2804,14 @@ def test_baselines_train_on_finite_losses_that_reach_every_part(scene, kind):
     if kind == "hanerf":
         lost = [n for n in lost if n != "appearance.weight"]
     assert lost == []
+
+
+@pytest.mark.parametrize("kind", ["nerfw", "hanerf"])
+def test_baselines_have_finite_losses_under_mixed_precision(scene, kind):
+    model = baseline(scene, kind)
+    batch = model.batch(torch.nonzero(~scene.is_test)[:, 0], generator())
+    with torch.autocast("cpu", torch.bfloat16):
+        assert losses_are_finite(model, *batch)
 
 
 def rendered(model, scene, transient=None):
@@ -3680,14 +3861,6 @@ def trained(tmp_path_factory):
     frames = {i: g.render_photo(model, scene, i, code) for i in photos}
     return SimpleNamespace(model=model, scene=scene, arrays=arrays, frames=frames,
                            log=last_log(run))
-
-
-def constant_sdf(model, value):
-    with torch.no_grad():
-        model.sdf.lin2.weight.zero_()
-        model.sdf.lin2.bias.fill_(value)
-    model.refresh_cache(0, 1)
-    return model
 
 
 def test_failure_01_no_nan_when_rays_miss_the_sphere(warm, scene):
