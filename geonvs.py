@@ -1239,12 +1239,18 @@ def read_checkpoint(path: Path, device="cpu") -> dict:
     if not path.exists():
         raise UserError(f"{path} does not exist: nothing to resume, start without --resume")
     try:
-        saved = torch.load(path, map_location=device, weights_only=True)
+        data_prep.refuse_bomb(path)
+        saved = dict(torch.load(path, map_location=device, weights_only=True))
+        config, step = saved["config"], saved["state"]["step"]
+        kinds = {f.name: (float, int) if f.type == "float" else type(f.default)
+                 for f in fields(Config)}
+        is_ours = (saved["geonvs"] == 1 and config.keys() == kinds.keys()
+                   and all(isinstance(config[name], kind) for name, kind in kinds.items())
+                   and isinstance(step, int) and step >= 0)
     except Exception as error:  # a damaged file can fail in any layer: zip, pickle, tensor storage
         raise UserError(f"{path} is damaged or not a checkpoint ({type(error).__name__}): "
                         "delete it and train again") from None
-    known = {f.name for f in fields(Config)}
-    if not isinstance(saved, dict) or saved.get("geonvs") != 1 or set(saved.get("config", ())) != known:
+    if not is_ours:
         raise UserError(f"{path} is not a checkpoint of this program: delete it and train again")
     return saved
 
@@ -1300,7 +1306,7 @@ def train(cfg: Config, scene: Scene, run: Path, saved: dict | None = None):
     checkpoint, log_path = run / "checkpoint.pt", run / "log.jsonl"
     lines = []
     if saved is not None:
-        state = restore(saved, checkpoint, model, optimizer, gen)
+        state |= restore(saved, checkpoint, model, optimizer, gen)
         meter.joules = state["joules"] if meter.counter else None  # all of it was measured, or None
         meter.sampled_joules = state["sampled_joules"] if meter.power else None
         if log_path.exists():
@@ -2045,6 +2051,7 @@ def main(argv: list[str] | None = None) -> None:
     else:
         saved = read_checkpoint(run / "checkpoint.pt", device) if "resume" in commands else None
         cfg = Config(**saved["config"] | given) if saved else cfg
+        check(cfg)
         execute(cfg, find_scene(cfg), run, saved)
 
 

@@ -12,6 +12,7 @@ import io
 import itertools
 import json
 import math
+import pickle
 import re
 import shutil
 import signal
@@ -21,7 +22,9 @@ import sys
 import tarfile
 import threading
 import time
+import tracemalloc
 import types
+import zipfile
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -683,6 +686,17 @@ def survives(model, name, data):
         (folder / name).write_bytes(good[name])
 
 
+@contextlib.contextmanager
+def peak_below(size):
+    """Python and numpy take less than `size` bytes at any moment."""
+    tracemalloc.start()
+    try:
+        yield
+        assert tracemalloc.get_traced_memory()[1] < size
+    finally:
+        tracemalloc.stop()
+
+
 BINS = ["cameras.bin", "images.bin", "points3D.bin"]
 
 
@@ -710,10 +724,12 @@ def test_random_and_flipped_bytes_do_no_harm(model, name, data):
 @pytest.mark.parametrize("count", [4, 1000, 2 ** 31, 2 ** 40, 2 ** 63, 2 ** 64 - 1])
 def test_promised_counts_are_checked_before_memory_is_taken(model, name, count):
     data = model[1][name]
-    assert not survives(model, name, struct.pack("<Q", count) + data[8:])
+    with peak_below(2 ** 20):
+        assert not survives(model, name, struct.pack("<Q", count) + data[8:])
     at = {"images.bin": data.find(b"a b.jpg\0") + 8, "points3D.bin": 8 + 43}.get(name)   # of the first record
     if at:
-        assert not survives(model, name, data[:at] + struct.pack("<Q", count) + data[at + 8:])
+        with peak_below(2 ** 20):
+            assert not survives(model, name, data[:at] + struct.pack("<Q", count) + data[at + 8:])
 
 
 @QUICK
@@ -726,6 +742,133 @@ def test_random_tables_do_no_harm(tmp_path, text):
         except UserError:
             continue
         assert set(split.values()) <= {"train", "test"} and not any(".." in n.split("/") for n in split)
+
+
+TABLE = (b"filename\tid\tsplit\tdataset\na b.jpg\t1\ttest\tx\nsub/c.jpg\t2.0\ttrain\tx\n"
+         b"d.png\t\ttrain\tx\n")
+
+
+@QUICK
+@given(end=st.integers(0, len(TABLE)),
+       flips=st.lists(st.integers(0, 8 * len(TABLE) - 1), max_size=4))
+def test_damaged_tables_do_no_harm(tmp_path, end, flips):
+    data = bytearray(TABLE)
+    for at in flips:
+        data[at // 8] ^= 1 << at % 8
+    (tmp_path / "s.tsv").write_bytes(data[:end])
+    try:
+        split = data_prep.read_split(tmp_path / "s.tsv")
+    except UserError as e:
+        assert "\n" not in str(e)
+    else:
+        assert set(split.values()) <= {"train", "test"} and len(split) <= 3
+
+
+# ---- hostile scene files -------------------------------------------------------------------------
+
+HOSTILE = settings(max_examples=40, deadline=None, derandomize=True,
+                   suppress_health_check=[HealthCheck.function_scoped_fixture])
+
+
+def zipped(scene, save=np.savez):
+    file = io.BytesIO()
+    save(file, **scene)
+    return file.getvalue()
+
+
+@pytest.fixture(scope="module")
+def stored():
+    return zipped(data_prep.make_toy(size=16, photos=4, test=1))
+
+
+def readable(path, data):
+    """Is it a scene, then a usable one? If not, one sentence says so."""
+    path.write_bytes(data)
+    try:
+        scene = data_prep.read_scene(path)
+    except UserError as e:
+        assert "\n" not in str(e) and path.name in str(e)
+        return False
+    assert len(g.load_scene(scene, "cpu", 16).wh) == 5
+    return True
+
+
+@HOSTILE
+@given(data=st.data())
+def test_damaged_scene_files_do_no_harm(tmp_path, stored, data):
+    """Bits flipped anywhere, in the directory at the end, in an array's header; cut off; noise."""
+    path, good = tmp_path / "s.npz", bytearray(stored)
+    header = good.find(b"NUMPY")
+    parts = [(0, len(good)), (good.find(b"PK\1\2"), len(good)), (header, header + 120)]
+    low, high = data.draw(st.sampled_from(parts))
+    for at in data.draw(st.lists(st.integers(8 * low, 8 * high - 1), min_size=1, max_size=4)):
+        good[at // 8] ^= 1 << at % 8
+    readable(path, bytes(good))
+    assert not readable(path, stored[:data.draw(st.integers(0, len(stored) - 23))])
+    assert not readable(path, data.draw(st.binary(max_size=200)))
+
+
+JUNK = [np.array(0), np.zeros((5, 0)), np.zeros((2, 3, 4)), np.array("x"), np.array(["a", "b"]),
+        np.full(5, np.nan), np.full(5, -1), np.zeros(5, bool), np.array(2 + 3j), np.zeros(5, "V4"),
+        np.zeros(5, "M8[s]"), np.array([2 ** 63], np.uint64), np.array("[1]"), np.array("{}")]
+
+
+@HOSTILE
+@given(data=st.data())
+def test_scene_files_with_a_wrong_array_are_refused(tmp_path, stored, data):
+    with np.load(io.BytesIO(stored)) as file:
+        scene = dict(file)
+    key = data.draw(st.sampled_from(sorted(set(scene) - {"depth", "occluder"})))  # the toy's own
+    junk = scene | {key: data.draw(st.sampled_from(JUNK))}
+    assert not readable(tmp_path / "s.npz", zipped(junk))
+    index = data.draw(st.sampled_from(["start", "wh", "track_photo", "track_point"]))
+    assert not readable(tmp_path / "s.npz", zipped(scene | {index: scene[index] + 10 ** 6}))
+    del scene[key]
+    assert not readable(tmp_path / "s.npz", zipped(scene))
+
+
+@pytest.mark.parametrize("count", [10 ** 5, 2 ** 31, 2 ** 40, 2 ** 62, 2 ** 80])
+def test_promised_shapes_are_checked_before_memory_is_taken(tmp_path, stored, count):
+    with np.load(io.BytesIO(stored)) as file:
+        scene = dict(file)
+    with zipfile.ZipFile(tmp_path / "s.npz", "w") as file:
+        for key, value in scene.items():
+            array = io.BytesIO()
+            shape = (count, 3) if key == "rgb" else value.shape
+            np.lib.format.write_array_header_1_0(
+                array, dict(descr=value.dtype.str, fortran_order=False, shape=shape))
+            file.writestr(f"{key}.npy", array.getvalue() + value.tobytes())
+    with peak_below(2 ** 21):
+        assert not readable(tmp_path / "s.npz", (tmp_path / "s.npz").read_bytes())
+
+
+def test_a_scene_file_larger_inside_than_outside_is_refused_unread(tmp_path, stored):
+    with np.load(io.BytesIO(stored)) as file:
+        bomb = zipped(dict(file) | dict(rgb=np.zeros((2 ** 24, 3), np.uint8)), np.savez_compressed)
+    assert len(bomb) < 2 ** 20
+    with peak_below(2 ** 22):
+        assert not readable(tmp_path / "s.npz", bomb)
+
+
+class Evil:
+    """Makes a file when it is unpickled."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return Path.touch, (self.path,)
+
+
+def test_a_scene_file_never_runs_code(tmp_path, stored):
+    with np.load(io.BytesIO(stored)) as file:
+        scene = dict(file)
+    scene["name"] = np.array([Evil(tmp_path / "harm")] * 5, object)
+    assert not readable(tmp_path / "s.npz", zipped(scene))
+    assert not readable(tmp_path / "s.npz", pickle.dumps(Evil(tmp_path / "harm")))
+    assert not (tmp_path / "harm").exists()
+    pickle.loads(pickle.dumps(Evil(tmp_path / "harm")))  # it is live
+    assert (tmp_path / "harm").exists()
 
 
 # ---- writing, download, command line -----------------------------------------------------------------
@@ -3087,7 +3230,8 @@ def six(scene, tmp_path_factory):
         patch.setattr(g, "CHECKPOINT_S", -1.0)  # after every step
         patch.setattr(g, "save_checkpoint", keep)
         model, state, _ = run_training(scene, run)
-    return SimpleNamespace(run=run, model=model, state=state)
+    saved = g.read_checkpoint(run / "after_3.pt")
+    return SimpleNamespace(run=run, model=model, state=state, saved=saved)
 
 
 def test_training_counts_its_steps_and_logs_them(six):
@@ -3317,6 +3461,93 @@ def test_a_bad_checkpoint_is_refused_in_one_sentence(six, tmp_path, kind):
     with pytest.raises(UserError) as error:
         g.read_checkpoint(tmp_path / "checkpoint.pt")
     assert "checkpoint.pt" in str(error.value) and "\n" not in str(error.value)
+
+
+@pytest.fixture
+def restored(scene, tmp_path):
+    """Is what these bytes hold restored? If not, one sentence says so."""
+    model, path, gen = new_model(scene), tmp_path / "checkpoint.pt", generator()
+    optimizer = g.make_optimizer(model)
+
+    def restored(data):
+        path.write_bytes(data)
+        try:
+            state = g.restore(g.read_checkpoint(path), path, model, optimizer, gen)
+        except UserError as e:
+            assert "\n" not in str(e) and path.name in str(e)
+            return False
+        assert isinstance(state["step"], int)
+        return True
+    return restored
+
+
+@settings(HOSTILE, max_examples=25)
+@given(data=st.data())
+def test_damaged_checkpoints_do_no_harm(six, restored, data):
+    """Bits flipped anywhere, in the directory at the end, in the pickle; cut off; noise."""
+    stored = (six.run / "after_3.pt").read_bytes()
+    good, at = bytearray(stored), stored.find(b"data.pkl")
+    parts = [(0, len(good)), (good.find(b"PK\1\2"), len(good)), (at, at + 6000)]
+    low, high = data.draw(st.sampled_from(parts))
+    for at in data.draw(st.lists(st.integers(8 * low, 8 * high - 1), min_size=1, max_size=4)):
+        good[at // 8] ^= 1 << at % 8
+    restored(bytes(good))
+    assert not restored(stored[:data.draw(st.integers(0, len(stored) - 23))])
+    assert not restored(data.draw(st.binary(max_size=200)))
+
+
+def torch_bytes(value, **how):
+    file = io.BytesIO()
+    torch.save(value, file, **how)
+    return file.getvalue()
+
+
+ODD = [None, 0, -1, 1e300, math.nan, "x", [], {}, [1, 2], {"a": 1}, torch.zeros(0),
+       torch.zeros(3, 3), torch.tensor(2), torch.full((5,), 2 ** 62)]
+PLACES = """geonvs config config.scene config.rays config.lam_gpl model model.calibration octrees
+    octrees.0 octrees.0.0 optimizer optimizer.param_groups rng state state.step""".split()
+
+
+@settings(HOSTILE, max_examples=20)
+@given(place=st.sampled_from(PLACES), odd=st.sampled_from(ODD))
+def test_checkpoints_with_a_wrong_value_are_refused(six, restored, place, odd):
+    """A value of the right kind may pass (other settings, an octree that is split nowhere)."""
+    saved = copy.deepcopy(six.saved)
+    *inside, last = (int(key) if key.isdigit() else key for key in place.split("."))
+    inside = functools.reduce(lambda value, key: value[key], inside, saved)
+    kinds = (int, float) if isinstance(inside[last], float) else type(inside[last])
+    inside[last] = odd
+    assert not restored(torch_bytes(saved)) or isinstance(odd, kinds)
+    assert not restored(torch_bytes(odd))
+
+
+def test_a_checkpoint_larger_inside_than_outside_is_refused_unread(
+        six, restored, tmp_path, monkeypatch):
+    loads, load = [], torch.load
+    monkeypatch.setattr(torch, "load", lambda *a, **k: (loads.append(1), load(*a, **k))[1])
+    assert restored((six.run / "after_3.pt").read_bytes()) and len(loads) == 1
+    with zipfile.ZipFile(six.run / "after_3.pt") as good, \
+            zipfile.ZipFile(tmp_path / "bomb", "w", zipfile.ZIP_DEFLATED) as bomb:
+        for name in good.namelist():
+            bomb.writestr(name, good.read(name))
+        bomb.writestr("archive/data/999", bytes(2 ** 24))
+    assert not restored((tmp_path / "bomb").read_bytes())
+    old = torch_bytes(six.saved, _use_new_zipfile_serialization=False)
+    assert not restored(old)  # no zip file: the sizes in it could not be checked
+    assert len(loads) == 1
+
+
+def test_a_checkpoint_never_runs_code(six, restored, tmp_path):
+    assert not restored(torch_bytes(six.saved | dict(state=Evil(tmp_path / "harm"))))
+    assert not restored(pickle.dumps(Evil(tmp_path / "harm")))
+    assert not (tmp_path / "harm").exists()
+
+
+def test_settings_of_a_resumed_run_are_checked_too(desk, capsys):
+    assert command(*FLAGS, "--steps=1", "--name=a", "--photos=3", "--rays=63") == 0
+    capsys.readouterr()
+    assert command("--resume", "--name=a", "--rays=64") == 2  # no multiple of its 3 photos
+    assert capsys.readouterr().err.count("\n") == 1
 
 
 @pytest.mark.parametrize("changes", [dict(hidden=8), dict(levels=3), dict(background="off"), dict(appearance="off")])
