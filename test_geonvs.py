@@ -4085,7 +4085,7 @@ def trained(tmp_path_factory):
     scene = g.load_scene(arrays, "cpu", 32)
     run = tmp_path_factory.mktemp("trained")
     model, *_ = run_training(
-        scene, run, rays=192, photos=6, samples=12, bg_samples=6, hidden=32, channels=4, steps=200,
+        scene, run, rays=144, photos=6, samples=12, bg_samples=4, hidden=32, channels=4, steps=180,
         lr_net=5e-3, lr_grid=2e-2, lr_zeta=1e-2, mask="on", appearance="on")
     code = model.codes()[~scene.is_test].mean(0).detach()
     photos = [*scene.photos(False)[::3].tolist(), *scene.photos(True).tolist()]
@@ -4371,7 +4371,7 @@ def exposures(scene, tmp_path_factory):
     grey = torch.where(torch.arange(len(scene.wh)) % 2 == 0, 64, 191).to(torch.uint8)
     rgb = grey.repeat_interleave(scene.start.diff())[:, None].expand(-1, 3).contiguous()
     flat = scene._replace(rgb=rgb)
-    model, *_ = run_training(flat, tmp_path_factory.mktemp("exposures"), steps=200, rays=96,
+    model, *_ = run_training(flat, tmp_path_factory.mktemp("exposures"), steps=160, rays=64,
                              appearance="on", background="on", mask="off", lr_net=2e-2)
     return SimpleNamespace(model=model, scene=flat, grey=grey.float() / 255)
 
