@@ -26,8 +26,8 @@ A scene is one .npz. I photos, N pixels, K points, T observations; R rays, P par
 The landmark lies in the unit sphere. A ray is c2w[:, 3] + t * d with |d| = 1; a distance is this t,
 never a z-depth. Functions raise UserError, one sentence that says what to do.
 """
-import argparse, gzip, http.client, inspect, itertools, json, os, shutil, struct, sys, tarfile
-import urllib.request, zipfile, zlib
+import argparse, gzip, http.client, inspect, itertools, json, math, os, shutil, struct, sys
+import tarfile, urllib.request, zipfile, zlib
 from pathlib import Path
 
 import cv2
@@ -39,8 +39,6 @@ SCENES = {"brandenburg": ("brandenburg_gate", "brandenburg.tsv"),   # name: (arc
           "taj": ("taj_mahal", "taj_mahal.tsv")}
 ARCHIVE_URL = "https://www.cs.ubc.ca/research/kmyi_data/imw2020/TrainingData/"
 SPLIT_URL = "https://nerf-w.github.io/data/selected_images/"
-SCENE_KEYS = {*"rgb start wh K c2w near is_test name points track_photo track_point".split(),
-              *"center scale footprint exposure_spread bg_color info".split()}
 POINT = np.dtype([("id", "u8"), ("xyz", "f8", 3), ("error", "f8"), ("views", "i8")])   # error [px]
 
 
@@ -74,24 +72,50 @@ def write_scene(path, scene):
     atomic_write(path, lambda part: np.savez(part, **scene))
 
 
+def refuse_bomb(path):
+    """Raises BadZipFile for what is no zip file, or larger inside than outside: ours never are."""
+    with zipfile.ZipFile(path) as file:
+        if sum(member.file_size for member in file.infolist()) > os.path.getsize(path):
+            raise zipfile.BadZipFile(f"{path} is larger inside than outside")
+
+
 def read_scene(path):
     """The dictionary of a scene file; UserError if it is not one, or not all of it."""
     try:
+        refuse_bomb(path)
+        with zipfile.ZipFile(path) as file:   # what a header promises must be there
+            for member in file.infolist():
+                with file.open(member) as array:
+                    np.lib.format.read_magic(array)
+                    shape, _, dtype = np.lib.format.read_array_header_1_0(array)
+                    need(math.prod(shape) * dtype.itemsize <= member.file_size, "")
         with np.load(path, allow_pickle=False) as file:
             scene = {key: file[key] for key in file.files}
-    except (OSError, ValueError, EOFError, TypeError, AttributeError, KeyError, MemoryError,
-            NotImplementedError, struct.error, zipfile.BadZipFile, zlib.error) as e:   # any layer
-        raise UserError(f"cannot read {path} ({type(e).__name__}): delete it, it is made again") from e
-    broken = f"{path} is no complete scene file of this version: delete it to have it made again"
-    need(SCENE_KEYS <= set(scene), broken)
-    start, wh, count = scene["start"], scene["wh"], len(scene["wh"])
-    need(all(len(scene[k]) == count for k in ("K", "c2w", "near", "is_test", "name")) and count > 0
-         and wh.shape == (count, 2) and (wh > 0).all() and start.shape == (count + 1,)
-         and (np.diff(start) == wh.prod(1, dtype=np.int64)).all() and start[0] == 0
-         and scene["rgb"].shape == (start[-1], 3) and scene["rgb"].dtype == np.uint8
-         and all(np.isfinite(scene[k]).all() for k in ("K", "c2w", "near", "points"))
-         and (~scene["is_test"].astype(bool)).any(), broken)
+        is_whole = is_consistent(scene)
+    except Exception as e:   # a damaged file can fail in any layer: zip, array header, dtype, text
+        raise UserError(f"cannot read {path} ({type(e).__name__}): delete it, it is remade") from e
+    need(is_whole, f"{path} is no complete scene file of this version: delete it, it is remade")
     return scene
+
+
+def is_consistent(scene):
+    """Do the arrays of a scene fit together? Wrong shapes and types may also raise anything."""
+    start, wh, count, points = scene["start"], scene["wh"], len(scene["wh"]), len(scene["points"])
+    photo, point, info = scene["track_photo"], scene["track_point"], json.loads(str(scene["info"]))
+    shapes = dict(rgb=(start[-1], 3), start=(count + 1,), wh=(count, 2), K=(count, 4),
+                  c2w=(count, 3, 4), near=(count,), is_test=(count,), name=(count,),
+                  points=(points, 3), track_photo=photo.shape[:1], track_point=photo.shape[:1],
+                  center=(3,), scale=(), footprint=(), exposure_spread=(), bg_color=(3,), info=())
+    kinds = dict(rgb="u", is_test="b", name="U", info="U") | dict.fromkeys(
+        ("start", "wh", "track_photo", "track_point"), "i")
+    return (all(scene[k].shape == v and scene[k].dtype.kind == kinds.get(k, "f")
+                for k, v in shapes.items())
+            and count > 0 and (wh > 0).all() and scene["rgb"].dtype == np.uint8 and start[0] == 0
+            and (np.diff(start) == wh.prod(1, dtype=np.int64)).all() and not scene["is_test"].all()
+            and all(np.isfinite(scene[k]).all() for k in shapes if k not in {*kinds, "bg_color"})
+            and min(scene["footprint"], scene["scale"]) > 0
+            and ((0 <= photo) & (photo < count) & (0 <= point) & (point < points)).all()
+            and {"scene", "kind", "downscale"} <= info.keys())
 
 
 # ---- the toy: z up, front towards -y, in its own units; world = TOY_SCALE * x + TOY_ORIGIN -------
@@ -394,10 +418,10 @@ def finish(scene, c2w, points, track_photo, track_point, pixels, contain, info):
 def statistics(scene):
     """What geonvs.py decides by: adds footprint, exposure_spread and bg_color to a scene.
 
-    footprint: lower quartile of a pixel's size at the SfM points inside the sphere, over the training
-    photos, so that the closest photos decide without single outliers. exposure_spread: standard
-    deviation over photos of how much brighter (0..1) each shows the same points. bg_color (3,): the
-    colour of the rays that miss the sphere, NaN unless three in five agree.
+    footprint: lower quartile of a pixel's size at the SfM points inside the sphere, over the
+    training photos, so that the closest photos decide without single outliers. exposure_spread:
+    standard deviation over photos of how much brighter (0..1) each shows the same points. bg_color
+    (3,): the colour of the rays that miss the sphere, NaN unless three in five agree.
     """
     K, c2w, photo = scene["K"], scene["c2w"], scene["track_photo"]
     keep = ~scene["is_test"][photo]
@@ -405,7 +429,8 @@ def statistics(scene):
     size, bright = np.zeros(len(photo)), np.full(len(photo), np.nan)
     beyond, step = [], max(1, len(scene["rgb"]) // 500_000)
     for i in np.flatnonzero(~scene["is_test"]):
-        rgb, (w, h), mine = scene["rgb"][scene["start"][i]:scene["start"][i + 1]], scene["wh"][i], photo == i
+        rgb = scene["rgb"][scene["start"][i]:scene["start"][i + 1]]
+        (w, h), mine = scene["wh"][i], photo == i
         uv, distance = project(K[i], c2w[i], scene["points"][point[mine]].astype(float))
         at = np.clip(uv.astype(int), 0, (w - 1, h - 1)) @ (1, w)
         size[mine], bright[mine] = distance / K[i, 0], rgb[at].mean(1) / 255

@@ -378,7 +378,7 @@ class Octree(nn.Module):
         fx, fy, fz = inside.reshape(-1, 3).T.contiguous()  # (PL,)
         yz = fy * fz
         basis = torch.stack([torch.ones_like(fx), fz, fy, yz, fx, fx * fz, fx * fy, fx * yz], 1)
-        with torch.autocast(x.device.type, enabled=False):  # [D9]
+        with torch.autocast(x.device.type, enabled=False):  # [D9] corners have float32 features
             w = basis @ TRILINEAR[:, :8 * J].to(x.device)  # (PL,8) to (PL,8J)
         out = Interpolate.apply(self.features, corner.reshape(-1, 8), w.reshape(-1, J, 8))
         return out.reshape(P, L, J, self.features.shape[1])
@@ -453,7 +453,8 @@ def finite_differences(sdf, x: Tensor, eps: float, centre: Tensor | None = None)
     k = TETRAHEDRON.to(x.device) / math.sqrt(3)  # (4,3)
     taps = sdf((x[:, None] + eps * k).reshape(-1, 3)).reshape(-1, 4)  # (P,4)
     centre = sdf(x) if centre is None else centre  # (P,)
-    grad = 0.75 / eps * (taps @ k)  # (P,3); sum over taps of k k^T is 4/3 times the identity
+    slope = (taps[:, :, None] * k).sum(1)  # (P,3) not taps @ k: autocast would round the taps [D9]
+    grad = 0.75 / eps * slope  # (P,3); sum over taps of k k^T is 4/3 times the identity
     return grad, 6 / eps ** 2 * (taps.mean(1) - centre)  # (P,3), (P,)
 
 
@@ -473,12 +474,13 @@ class LipschitzMLP(nn.Module):
         self.c = nn.Parameter(torch.log(torch.expm1(2 * bound)))  # (layers,)
 
     def bounds(self) -> Tensor:
-        """Lipschitz bound of each layer in the max norm."""
-        return F.softplus(self.c)
+        """Lipschitz bound of each layer in the max norm; above 0, as the loss takes its log."""
+        return F.softplus(self.c).clamp(min=1e-6)
 
     def forward(self, x: Tensor) -> Tensor:
         for i, (layer, bound) in enumerate(zip(self.layers, self.bounds())):
-            scale = (bound / layer.weight.abs().sum(1)).clamp(max=1)  # (out,)
+            norm = layer.weight.abs().sum(1).clamp(min=1e-9)  # (out,)
+            scale = (bound / norm).clamp(max=1)  # (out,)
             x = F.relu(x) if i else x
             x = F.linear(x, layer.weight * scale[:, None], layer.bias)  # (P,out)
         return x
@@ -1332,13 +1334,18 @@ def read_checkpoint(path: Path, device="cpu") -> dict:
     if not path.exists():
         raise UserError(f"{path} does not exist: nothing to resume, start without --resume")
     try:
-        saved = torch.load(path, map_location=device, weights_only=True)
+        data_prep.refuse_bomb(path)
+        saved = dict(torch.load(path, map_location=device, weights_only=True))
+        config, step = saved["config"], saved["state"]["step"]
+        kinds = {f.name: (float, int) if f.type == "float" else type(f.default)
+                 for f in fields(Config)}
+        is_ours = (saved["geonvs"] == 1 and config.keys() == kinds.keys()
+                   and all(isinstance(config[name], kind) for name, kind in kinds.items())
+                   and isinstance(step, int) and step >= 0)
     except Exception as error:  # a damaged file can fail in any layer: zip, pickle, tensor storage
         raise UserError(f"{path} is damaged or not a checkpoint ({type(error).__name__}): "
                         "delete it and train again") from None
-    known = {f.name for f in fields(Config)}
-    ours = isinstance(saved, dict) and saved.get("geonvs") == 1
-    if not ours or set(saved.get("config", ())) != known:
+    if not is_ours:
         raise UserError(f"{path} is not a checkpoint of this program: delete it and train again")
     return saved
 
@@ -1400,7 +1407,7 @@ def train(cfg: Config, scene: Scene, run: Path, saved: dict | None = None):
     checkpoint, log_path = run / "checkpoint.pt", run / "log.jsonl"
     lines = []
     if saved is not None:
-        state = restore(saved, checkpoint, model, optimizer, gen)
+        state |= restore(saved, checkpoint, model, optimizer, gen)
         state |= dict(joules=0.0, sampled_joules=0.0) if RANK else {}  # what all spent counts once
         meter.joules = state["joules"] if meter.counter else None  # all of it was measured, or None
         meter.sampled_joules = state["sampled_joules"] if meter.power else None
@@ -2274,6 +2281,7 @@ def main(argv: list[str] | None = None) -> None:
     else:
         saved = read_checkpoint(run / "checkpoint.pt", device) if "resume" in commands else None
         cfg = Config(**saved["config"] | given) if saved else cfg
+        check(cfg)
         try:
             arrays = RANK or find_scene(cfg)
         finally:  # the others read what the first one made, or fail as it did
