@@ -7,6 +7,7 @@ the sections follow one ray from the pixel to the loss, then the training loop a
     python geonvs.py                       toy scene: made, trained, scored (minutes, 2 CPU cores)
     python geonvs.py --scene brandenburg   a Phototourism scene (one GPU); also sacre, trevi, taj
     python geonvs.py --data DIR            your own COLMAP folder
+    torchrun --nproc_per_node 4 geonvs.py  the same on 4 GPUs, that share the rays of each step
     python geonvs.py --help                every setting with its meaning, unit and source
 
 A run writes runs/<name>/: metrics.json, log.jsonl, checkpoint.pt, panel.png, mesh.ply.
@@ -39,6 +40,7 @@ Where the printed paper is departed from, the line carries its tag:
 from __future__ import annotations
 
 import argparse
+import contextlib
 import difflib
 import itertools
 import json
@@ -51,13 +53,16 @@ import sys
 import threading
 import time
 import zlib
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, field, fields
+from multiprocessing import get_context
 from pathlib import Path
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 import torch
+import torch.distributed as dist
 import torch.nn.functional as F
 from skimage.measure import marching_cubes
 from skimage.metrics import structural_similarity
@@ -81,19 +86,21 @@ class Config:
     scene: str = opt("toy", "toy, brandenburg, sacre, trevi or taj")
     data: str = opt("", "an IMC-PT or COLMAP folder instead of a named scene")
     method: str = opt("geonvsw", "which model to train", "geonvsw", "nerfw", "hanerf")
+    preset: str = opt("default", "quality against speed: see PRESETS", "fast", "default", "best")
+    tuned: bool = opt(False, "a baseline's settings that serve the toy best, not its paper's")
     name: str = opt("", "run folder below runs/ (default: scene-method-seed)")
     seed: int = opt(0, "seed of everything random")
     device: str = opt("auto", "auto, cpu, cuda or cuda:N")
     steps: int = opt(4000, "training steps")
     minutes: float = opt(0.0, "training budget in minutes, 0: until --steps is reached")
     downscale: int = opt(2, "integer factor by which photos are made smaller (benchmarks use 2)")
-    rays: int = opt(512, "rays per step")
+    rays: int = opt(512, "rays per step, of all processes together")
     photos: int = opt(8, "photos per step; the mask network sees these whole")
     samples: int = opt(16, "foreground samples per ray")
     bg_samples: int = opt(16, "background samples per ray")
     levels: int = opt(0, "octree levels, 0: from the pixel footprint at the surface")
     grid: str = opt("octree", "uniform: the same finest cell everywhere", "octree", "uniform")
-    split_error: float = opt(0.02, "mean L1 error of rays that splits the cell they end in [R]")
+    split_error: float = opt(1.0, "a cell is split if its rays err more than this times the median")
     max_mb: float = opt(1000.0, "most memory that the foreground octree may take, MiB")
     bg_levels: int = opt(3, "octree levels of the background")
     channels: int = opt(4, "feature channels per octree level")
@@ -122,13 +129,16 @@ class Config:
     lr_net: float = opt(2e-3, "learning rate of networks and codes")
     lr_zeta: float = opt(1e-3, "learning rate of the deviation network")
     curve: bool = opt(False, "record PSNR of held-out left halves over s and Wh, for --chart")
-    amp: bool = opt(True, "mixed precision on a GPU [D9]")
+    amp: str = opt("auto", "mixed precision; auto: on a GPU [D9]", "auto", "on", "off")
     protocol: str = opt("half", "half: fit left, score right [D12]; leaky: all", "half", "leaky")
 
 
 LARGE = dict(steps=300_000, rays=4096, photos=16, samples=32, bg_samples=16, appearance_dim=32)
 # settings that differ from Config's defaults, by scene; flags override them
 SCENES = {"toy": dict(steps=3000), **{name: LARGE for name in data_prep.SCENES}}
+# factors on the scene's settings, from the front that --front measures
+PRESETS = {"fast": dict(steps=0.5, samples=0.5, bg_samples=0.5), "default": {},
+           "best": dict(steps=2, rays=2, samples=1.5, bg_samples=1.5)}
 
 
 # ---- 2 Scene file and rays -----------------------------------------------------------------------
@@ -368,7 +378,8 @@ class Octree(nn.Module):
         fx, fy, fz = inside.reshape(-1, 3).T.contiguous()  # (PL,)
         yz = fy * fz
         basis = torch.stack([torch.ones_like(fx), fz, fy, yz, fx, fx * fz, fx * fy, fx * yz], 1)
-        w = basis @ TRILINEAR[:, :8 * J].to(x.device)  # (PL,8) to (PL,8J)
+        with torch.autocast(x.device.type, enabled=False):  # [D9]
+            w = basis @ TRILINEAR[:, :8 * J].to(x.device)  # (PL,8) to (PL,8J)
         out = Interpolate.apply(self.features, corner.reshape(-1, 8), w.reshape(-1, J, 8))
         return out.reshape(P, L, J, self.features.shape[1])
 
@@ -378,15 +389,15 @@ class Octree(nn.Module):
 
 
 def seed_octree(octree: Octree, points: Tensor, dense: int, shell: tuple[float, float]) -> None:
-    """Splits all cells that touch the shell of radii up to level `dense`, then two levels of cells
-    near points: one cell on every side, so that the corners around a point are never hanging."""
+    """Splits all cells that touch the shell of radii up to level `dense`, then cells near points:
+    one cell on every side, so that the corners around a point are never hanging."""
     for level in range(octree.levels - 1):
         if level < dense:
             reach = octree.cell(level) * math.sqrt(3) / 2
             r = octree.centres(level).norm(dim=1)  # (N,)
             touches = (r > shell[0] - reach) & (r < shell[1] + reach)  # (N,)
             octree.split(level, octree.cells[level][touches])
-        elif len(points) and level < dense + 2:
+        elif len(points) and level == dense:
             octree.split(level, octree.around(octree.cell_of(points, level), level))
     octree.features.data[1:].normal_(0, octree.std)
 
@@ -729,19 +740,27 @@ class Method(nn.Module):
     def maintain(self, step: int, progress: float, optimizer: torch.optim.Optimizer) -> None:
         """After every step."""
 
+    def health(self) -> dict[str, Tensor]:
+        """More figures for a line of the log."""
+        return {}
 
-def worst_cells(octree: Octree, level: int, hits: Tensor, bound: float) -> Tensor:
-    """Cells (Q,3) where rays end that miss their colour by more than bound on average, and those
-    around them, worst first. hits: (P,4) where rays ended, and their error."""
-    at, which = octree.cell_of(hits[:, :3], level).unique(dim=0, return_inverse=True)
-    error = hits.new_zeros(len(at)).index_add_(0, which, hits[:, 3])  # (Q,)
-    error = error / torch.bincount(which, minlength=len(at))  # (Q,) mean over the rays
+
+def worth_splitting(octree: Octree, level: int, hits: Tensor, bound: float) -> Tensor:
+    """Cells (Q,3) where enough rays end, that miss their colour by more than bound on average, and
+    to whose pixels the children are not too fine; worst first. hits: (P,5), the rays' ends, errors
+    and pixel sizes there."""
+    at, which, count = octree.cell_of(hits[:, :3], level).unique(
+        dim=0, return_inverse=True, return_counts=True)
+    mean = hits.new_zeros(len(at), 2).index_add_(0, which, hits[:, 3:]) / count[:, None]  # (Q,2)
+    error, pixel = mean.unbind(1)  # (Q,)
+    pays = (count >= SPLIT_RAYS) & (error > bound) & (pixel < octree.cell(level) / 2)  # (Q,)
     worst = error.argsort(descending=True)
-    return octree.around(at[worst[error[worst] > bound]], level)
+    return at[worst[pays[worst]]]
 
 
 REFINE_AT = (0.1, 0.2, 0.3, 0.45, 0.6)  # shares of training at which the octree is refined
-SPLIT_BYTES = 512  # memory of one split: eight nodes and about as many corners
+SPLIT_RAYS = 4  # recent rays that end in a cell before it is split
+HIDDEN = 6.0  # zeta |s| from where on the field is not seen: sigmoid(-6) = 0.0025
 MASK_FROM = 0.2  # share of training after which the mask may act: before, every pixel is wrong
 
 
@@ -755,8 +774,9 @@ class GeoNVS(Method):
         self.sfm = scene.points[inside]  # (K,3)
         levels = cfg.levels or levels_for_footprint(float(scene.raw["footprint"]))
         octree = Octree(1.0, levels, cfg.channels, dev)
-        dense = 1 if len(self.sfm) and cfg.grid == "octree" else levels
-        seed_octree(octree, self.sfm, dense, (0.0, 1.0))  # [D10]
+        is_octree = len(self.sfm) > 0 and cfg.grid == "octree"
+        dense, radius = (1, 1.0) if is_octree else (levels, math.sqrt(3))
+        seed_octree(octree, self.sfm, dense, (0.0, radius))  # [D10]
         self.eps = octree.cell(levels - 1) / 2
         spread, sky = float(scene.raw["exposure_spread"]), torch.as_tensor(scene.raw["bg_color"])
         has_codes = cfg.appearance == "on" or cfg.appearance == "auto" and spread > 0.01
@@ -776,7 +796,7 @@ class GeoNVS(Method):
             bg_color=sky.float().nan_to_num(0.5), calibration=torch.tensor([0.0, 1.0]),
             level=torch.tensor(0.2),  # running median of the L1 error
             cache=torch.zeros(1, 1, n, n, n),  # SDF on a dense grid, for placing samples [D11]
-            hits=torch.full((2 ** 15, 4), 2.0),  # where recent rays ended, and their error
+            hits=torch.full((2 ** 18, 5), 2.0),  # where recent rays ended, their error, pixel size
             logits=torch.full((I, 1, m, m), -9.0),  # last output of the mask network
             seen=torch.full((I, 2, m, m), -1.0))  # last error and Phi by pixel
         for name, value in memory.items():
@@ -821,7 +841,7 @@ class GeoNVS(Method):
         """The objective, Eq. 5: its weighted sum, and by name the raw terms and health signals."""
         cfg, R, K, dev = self.cfg, len(rays.o), len(self.sfm), rays.o.device
         jitter = torch.rand(R, cfg.samples + cfg.bg_samples, generator=gen, device=dev)  # (R,S+B)
-        out = render_rays(self, rays, self.appearance(rays.img), jitter)
+        out = in_shares(lambda *v: render_rays(self, *v), rays, self.appearance(rays.img), jitter)
         e_grad, e_curv, hit = out["e_grad"], out["e_curv"], out["hit"]  # (R,)
         error = (out["rgb"] - rays.rgb).abs().mean(1)  # (R,) L1
         is_masking = self.use_mask and progress > MASK_FROM
@@ -831,7 +851,8 @@ class GeoNVS(Method):
         edge = edge_indicator(e_grad, e_curv, cfg.lam_grad, cfg.lam_lap, calibration)  # (R,)
         edge = out["opacity"].detach() * edge  # (R,)
         sfm = torch.randint(max(K, 1), (R // 2 if K else 0,), generator=gen, device=dev)  # (R/2,)
-        s = self.sdf(torch.cat([random_ball(R // 2, gen), self.sfm[sfm]]))[0]  # (R/2 + R/2,)
+        x = torch.cat([random_ball(R // 2, gen), self.sfm[sfm]])  # (R/2 + R/2,3)
+        s = in_shares(lambda x: dict(sdf=self.sdf(x)[0]), x)["sdf"]  # (R/2 + R/2,)
         raw = dict(rgb=((1 - mask) * error).mean(),
                    eik=(out["eikonal"].mean(1) * hit).sum() / hit.sum().clamp(min=1),
                    curv=e_curv.mean(),  # [D4]
@@ -848,7 +869,9 @@ class GeoNVS(Method):
             if self.step % cfg.mask_every == 0:
                 total = total + self.mask_objective(pick)
         slot = (self.step * R + torch.arange(R, device=dev)) % len(self.hits)  # (R,)
-        self.hits[slot] = torch.cat([out["x"], ((1 - mask) * misfit)[:, None]], 1).nan_to_num(2, 2, 2)
+        pixel = out["depth"].detach() / self.scene.K[rays.img, 0]  # (R,) its size at the ray's end
+        told = torch.stack([(1 - mask) * misfit, pixel], 1)  # (R,2)
+        self.hits[slot] = torch.cat([out["x"], told], 1).nan_to_num(2, 2, 2)
         health = dict(zeta=self.deviation(), opacity=out["opacity"].mean(),
                       miss=1 - hit.float().mean(), mse=((out["rgb"] - rays.rgb) ** 2).mean())
         return total, {k: v.detach() for k, v in (raw | health).items()}
@@ -897,20 +920,28 @@ class GeoNVS(Method):
     @torch.no_grad()
     def refine(self, optimizer: torch.optim.Optimizer) -> None:
         """Fits the octree to the scene: no fine cell far from the surface or where pictures agree.
-        A cell of level >= 1 stays split while the surface is within a cell of it; worst cells there
-        are newly split, coarse levels first, up to cfg.max_mb. Adam's moments move along."""
-        octree, keys = self.sdf.octree, list(self.sdf.octree.split_keys)
-        hits = self.hits[self.hits[:, 0] < 2]  # (P,4) without the slots that no ray has filled
+        Cells of a level >= 1 are newly split at the surface where that pays, coarse levels first,
+        up to cfg.max_mb. A cell is merged again when nothing of it, nor within a child's side of
+        it, where corners become pinned, is nearer to the surface than HIDDEN / zeta: if |grad s| is
+        1, no pixel changes by more than 2 sigmoid(-HIDDEN) = 0.005. Adam's moments move along."""
+        octree, keys, zeta = self.sdf.octree, list(self.sdf.octree.split_keys), self.deviation()
+        hits = self.hits[self.hits[:, 0] < 2]  # (P,5) without the slots that no ray has filled
+        split_bytes = 8 * (36 + 4 * octree.features.shape[1])  # nodes, and as many corners
+        room = int(max(0, self.cfg.max_mb * 2 ** 20 - octree.bytes()) // split_bytes)
         for level in range(1, octree.levels - 1):
+            if not len(octree.cells[level]):
+                break
             s = torch.cat([self.sdf(x)[0] for x in octree.centres(level).split(CHUNK)])  # (N,)
-            is_close = s.abs() < (math.sqrt(3) / 2 + 1) * octree.cell(level)  # (N,)
-            close = octree.key(octree.cells[level][is_close], level)
-            worst = worst_cells(octree, level, hits, self.cfg.split_error)  # (Q,3)
-            new = octree.key(worst, level)
-            new = new[torch.isin(new, close) & ~torch.isin(new, keys[level])]
-            new = new if level <= 2 * self.refined + 1 else new[:0]
-            room = int(max(0, self.cfg.max_mb * 2 ** 20 - octree.bytes()) // SPLIT_BYTES)
-            keys[level] = torch.cat([keys[level][torch.isin(keys[level], close)], new[:room]])
+            reach = (math.sqrt(3) / 2 + 1) * octree.cell(level)
+            key = octree.key(octree.cells[level], level)  # (N,)
+            keys[level] = keys[level][torch.isin(keys[level], key[s.abs() < reach + HIDDEN / zeta])]
+            bound = self.cfg.split_error * self.level
+            new = octree.key(worth_splitting(octree, level, hits, bound), level)
+            new = new[torch.isin(new, key[s.abs() < reach]) & ~torch.isin(new, keys[level])]
+            new = new[:room] if level <= 2 * self.refined + 1 else new[:0]
+            room -= len(new)
+            keys[level] = torch.cat([keys[level], new])
+        keys = [k.to(hits.device) for k in agreed([k.cpu() for k in keys])]
         old = octree.features
         old_row = octree.build(keys)
         moments = optimizer.state.pop(old).items()
@@ -929,9 +960,23 @@ class GeoNVS(Method):
             self.refine(optimizer)
         self.refined += 1
         if self.refined == len(REFINE_AT) and self.cfg.mask == "auto" and self.use_mask:
-            share = self.logits[~self.scene.is_test].sigmoid().mean().item()
+            share = agreed(self.logits[~self.scene.is_test].sigmoid().mean().item())
             self.use_mask = share > 0.002
             print(f"  mean mask {share:.4f}: mask {'stays on' if self.use_mask else 'goes off'}")
+
+    @torch.no_grad()
+    def health(self) -> dict[str, Tensor]:
+        """Mean foreground opacity of rays from training photos to SfM points that they show."""
+        raw, scene, dev = self.scene.raw, self.scene, self.cache.device
+        img, x = (torch.as_tensor(raw[f"track_{k}"]).long().to(dev) for k in ("photo", "point"))
+        x = scene.points[x]  # (N,3), seen in photos img (N,)
+        pick = torch.nonzero(~scene.is_test[img] & (x.norm(dim=1) < 0.95))[:, 0]
+        pick = pick[::max(1, len(pick) // 256)]  # (R,)
+        img, o = img[pick], scene.c2w[img[pick], :, 3]  # (R,), (R,3)
+        d = F.normalize(x[pick] - o, dim=1)  # (R,3)
+        rays = Rays(o, d, scene.near[img], img, o[:, :2], o)
+        opacity = self.render(rays, self.appearance(img))["opacity"]
+        return dict(sfm_opacity=opacity.mean()) if len(pick) else {}
 
     def render(self, rays: Rays, code: Tensor) -> dict[str, Tensor]:
         """render_rays without jitter, for pictures and for fitting codes."""
@@ -1042,7 +1087,7 @@ class NeRFW(Method):
     def losses(self, rays: Rays, pick: Tensor, progress: float, gen: torch.Generator):
         """NeRF-W Eq. 13: squared error over learned variance, its log, a price on transients."""
         jitter = torch.rand(len(rays.o), 2 * self.cfg.samples, generator=gen, device=rays.o.device)
-        out = self.render(rays, self.codes()[rays.img], jitter, self.transient(rays.img))
+        out = in_shares(self.render, rays, self.codes()[rays.img], jitter, self.transient(rays.img))
         error = ((out["rgb"] - rays.rgb) ** 2).sum(1)  # (R,)
         raw = dict(coarse=((out["coarse"] - rays.rgb) ** 2).mean() / 2,
                    rgb=(error / (2 * out["beta"] ** 2)).mean(),
@@ -1094,7 +1139,7 @@ class HaNeRF(NeRFW):
         R, side = len(rays.o), math.isqrt(self.cfg.rays)
         jitter = torch.rand(R, 2 * self.cfg.samples, generator=gen, device=rays.o.device)
         code = self.encode(pick)  # (1,A)
-        out = self.render(rays, code.expand(R, -1), jitter)
+        out = in_shares(self.render, rays, code.expand(R, -1), jitter)
         mask = self.mask_of(rays, pick)  # (R,)
         error, coarse = (((out[k] - rays.rgb) ** 2).mean(1) for k in ("rgb", "coarse"))  # (R,)
         window = out["rgb"].reshape(1, side, side, 3).permute(0, 3, 1, 2)
@@ -1151,10 +1196,14 @@ class EnergyMeter:
         self.thread.join()
         self.tick()
 
+    def totals(self) -> list[float | None]:
+        """Joules by counter and by samples, over all processes; None if one cannot tell."""
+        each = [(agreed(self.joules, i), agreed(self.sampled_joules, i)) for i in range(RANKS)]
+        return [None if None in joules else sum(joules) for joules in zip(*each)]
+
     def report(self) -> dict:
         """Watt-hours by counter, else by samples; None where there is neither."""
-        joules = self.joules, self.sampled_joules
-        counter, sampled = (None if j is None else j / 3600 for j in joules)
+        counter, sampled = (None if j is None else j / 3600 for j in self.totals())
         off = abs(counter / sampled - 1) > 0.05 if counter and sampled else None
         return dict(energy_wh=sampled if counter is None else counter, energy_wh_sampled=sampled,
                     energy_source=self.source, energy_disagrees=off, idle_w=self.idle_w)
@@ -1179,8 +1228,8 @@ def rapl_meter(root: str = "/sys/class/powercap") -> EnergyMeter:
 
 def make_meter(device: torch.device) -> EnergyMeter:
     """NVML for a GPU, found by UUID whatever CUDA_VISIBLE_DEVICES says; RAPL for a CPU; or none."""
-    if device.type != "cuda":
-        return rapl_meter()
+    if device.type != "cuda":  # one process reads for its whole machine
+        return EnergyMeter("rapl", float) if LOCAL_RANK else rapl_meter()
     try:
         import pynvml
     except ImportError:
@@ -1199,12 +1248,59 @@ def make_meter(device: torch.device) -> EnergyMeter:
 
 # ---- 10 Training ---------------------------------------------------------------------------------
 
-METHODS = {  # and the published settings of the baselines
-    "geonvsw": (GeoNVS, {}),
-    "nerfw": (NeRFW, dict(rays=1024, photos=1024, samples=64, hidden=256, lr_net=5e-4)),
-    "hanerf": (HaNeRF, dict(rays=1024, photos=1, samples=64, hidden=256, lr_net=5e-4)),
+METHODS = {  # the published settings of the baselines, then those that serve the toy best
+    "geonvsw": (GeoNVS, {}, {}),
+    "nerfw": (NeRFW, dict(rays=1024, photos=1024, samples=64, hidden=256, lr_net=5e-4),
+              dict(rays=512, photos=512, samples=32, hidden=96, lr_net=2e-3)),
+    "hanerf": (HaNeRF, dict(rays=1024, photos=1, samples=64, hidden=256, lr_net=5e-4),
+               dict(samples=32, hidden=96, lr_net=2e-3)),
 }
 CHECKPOINT_S = 60.0  # seconds of training between checkpoints
+PATIENCE = 20  # steps in a row without a finite loss and gradient that stop a run
+HEALTH = {  # lowest and highest healthy value after a third of training, and what it can mean
+    "zeta": (30, math.inf, "the surface stays blurred: wrong poses or scale, or too few steps"),
+    "sfm_opacity": (0.7, math.inf, "rays to SfM points pass through: the background paints the "
+                    "landmark; raise --lam_sfm or train longer"),
+    "mask": (0, 0.5, "the mask covers half of the picture: raise --lam_mask"),
+    "eik": (0, 0.5, "the SDF is no distance: raise --lam_eik or lower --lr_grid"),
+    "miss": (0, 0.6, "most rays miss the unit sphere: is it the right landmark that it surrounds?"),
+}
+
+
+class Diverged(UserError):
+    """Training was stopped, as its losses or gradients were not finite."""
+
+# torchrun starts RANKS processes. All draw the same random numbers and each works on own rows of a
+# step, so that together they do what one does; the first alone speaks, decides, scores and writes.
+RANK, LOCAL_RANK, RANKS = (int(os.environ.get(name, default)) for name, default in (
+    ("RANK", 0), ("LOCAL_RANK", 0), ("WORLD_SIZE", 1)))
+atomic_write = (lambda path, write: None) if RANK else atomic_write
+
+
+def agreed(value, source: int = 0):
+    """The value that one process has, for all of them."""
+    box = [value]
+    if RANKS > 1:
+        dist.broadcast_object_list(box, source)
+    return box[0]
+
+
+def in_shares(f, *rows) -> dict[str, Tensor]:
+    """f(*rows), from R rows to R rows by name: a process computes every RANKS-th, and all get all.
+    Gradients flow to own rows alone, RANKS-fold, as their mean over the processes is taken."""
+    if RANKS == 1:
+        return f(*rows)
+    own = f(*[Rays(*(v[RANK::RANKS] for v in r)) if isinstance(r, Rays) else r[RANK::RANKS]
+              for r in rows])
+    flat = torch.cat([v.reshape(len(v), -1) for v in own.values()], 1)  # (R/RANKS,columns)
+    flat.register_hook(lambda grad: RANKS * grad)
+    whole = flat.new_zeros(len(rows[-1]), flat.shape[1])  # (R,columns)
+    whole[RANK::RANKS] = flat.detach()
+    dist.all_reduce(whole)
+    whole[RANK::RANKS] = flat
+    parts = zip(own.items(), whole.split([v.shape[1:].numel() for v in own.values()], 1))
+    return {name: (part if v.requires_grad else part.detach()).reshape(-1, *v.shape[1:])
+            for (name, v), part in parts}
 
 
 def make_optimizer(model: Method) -> torch.optim.Adam:
@@ -1241,7 +1337,8 @@ def read_checkpoint(path: Path, device="cpu") -> dict:
         raise UserError(f"{path} is damaged or not a checkpoint ({type(error).__name__}): "
                         "delete it and train again") from None
     known = {f.name for f in fields(Config)}
-    if not isinstance(saved, dict) or saved.get("geonvs") != 1 or set(saved.get("config", ())) != known:
+    ours = isinstance(saved, dict) and saved.get("geonvs") == 1
+    if not ours or set(saved.get("config", ())) != known:
         raise UserError(f"{path} is not a checkpoint of this program: delete it and train again")
     return saved
 
@@ -1269,13 +1366,19 @@ def training_step(model: Method, optimizer, photos: Tensor, state: dict, progres
     """One update. Returns the logs, and 1 if a loss or gradient that is not finite made it void."""
     cfg, device = model.cfg, photos.device
     rays, pick = model.batch(photos, gen)
-    with torch.autocast(device.type, torch.bfloat16, enabled=cfg.amp and device.type == "cuda"):
+    is_half = cfg.amp == "on" or cfg.amp == "auto" and device.type == "cuda"
+    with torch.autocast(device.type, torch.bfloat16, enabled=is_half):
         loss, logs = model.losses(rays, pick, progress, gen)
     optimizer.zero_grad()
     loss.backward()
     set_learning_rate(optimizer, state["step"], progress)
     parameters = [p for group in optimizer.param_groups for p in group["params"]]
-    norm = nn.utils.get_total_norm([p.grad for p in parameters if p.grad is not None])
+    grads = [p.grad for p in parameters if p.grad is not None]
+    if RANKS > 1:  # their mean over the processes
+        flat = nn.utils.parameters_to_vector(grads)
+        dist.all_reduce(flat)
+        nn.utils.vector_to_parameters(flat.div_(RANKS), grads)
+    norm = nn.utils.get_total_norm(grads)
     optimizer.found_inf = (~torch.isfinite(norm + loss.detach())).float()
     optimizer.step()
     model.maintain(state["step"], progress, optimizer)
@@ -1298,6 +1401,7 @@ def train(cfg: Config, scene: Scene, run: Path, saved: dict | None = None):
     lines = []
     if saved is not None:
         state = restore(saved, checkpoint, model, optimizer, gen)
+        state |= dict(joules=0.0, sampled_joules=0.0) if RANK else {}  # what all spent counts once
         meter.joules = state["joules"] if meter.counter else None  # all of it was measured, or None
         meter.sampled_joules = state["sampled_joules"] if meter.power else None
         if log_path.exists():
@@ -1305,46 +1409,64 @@ def train(cfg: Config, scene: Scene, run: Path, saved: dict | None = None):
     write_text(log_path, "".join(k for k in lines if json.loads(k)["step"] <= state["step"]))
     photos, held_out, codes = scene.photos(False), scene.photos(True), None  # (B,)
     dropped = torch.tensor(state["dropped"], device=device)
-    last_save = last_line = since = time.perf_counter()
+    streak, warned = torch.zeros_like(dropped), set()  # void steps in a row; warnings given
+    last_line = since = time.perf_counter()
+    last_save = state["seconds"]
     meter.start()
     if saved is None:
         model.start(gen)
+    for value in model.state_dict().values():
+        if RANKS > 1 and torch.is_tensor(value):  # GPUs do not repeat their sums to the last bit
+            dist.broadcast(value, 0)
 
     def clock():  # training seconds so far
         return state["seconds"] + time.perf_counter() - since
 
     def save():
-        state.update(joules=meter.joules, sampled_joules=meter.sampled_joules, dropped=int(dropped))
+        state.update(zip(("joules", "sampled_joules"), meter.totals()), dropped=int(dropped))
         save_checkpoint(checkpoint, cfg, model, optimizer, gen, state | dict(seconds=clock()))
     stop = threading.Event()  # Ctrl-C lets a step end, so that what is saved is whole
     handler = signal.signal(signal.SIGINT, lambda *_: stop.set())
     try:
-        while state["step"] < cfg.steps and not stop.is_set():
-            if cfg.minutes and clock() >= 60 * cfg.minutes:
-                break
-            spent = clock() / (60 * cfg.minutes) if cfg.minutes else 0
+        while True:
+            seconds, is_stopped = agreed((clock(), stop.is_set()))
+            spent = seconds / (60 * cfg.minutes) if cfg.minutes else 0
             progress = max(state["step"] / cfg.steps, spent)
+            if progress >= 1 or is_stopped:
+                break
             logs, is_dropped = training_step(model, optimizer, photos, state, progress, gen)
             dropped += is_dropped
-            if cfg.curve and len(held_out) and clock() > 4 * 1.5 ** len(state["curve"]):
+            streak = (streak + 1) * is_dropped
+            if state["step"] % PATIENCE == 0 and int(streak) >= PATIENCE:
+                break
+            if cfg.curve and len(held_out) and seconds > 4 * 1.6 ** len(state["curve"]):
                 state["seconds"] = clock()
                 meter.stop()  # looking costs neither time nor energy
-                codes, value = validate(model, scene, held_out, codes)
+                codes, value = validate(model, scene, held_out, codes) if RANK == 0 else (None, 0)
                 state["curve"].append(dict(step=state["step"], seconds=state["seconds"], psnr=value,
                                            wh=meter.report()["energy_wh"]))
                 meter.start()
                 since = time.perf_counter()
-            if time.perf_counter() - last_line > 5 or state["step"] == cfg.steps:
+            if RANK == 0 and (time.perf_counter() > last_line + 5 or state["step"] == cfg.steps):
                 last_line = time.perf_counter()
+                logs = model.health() | logs
                 report_line(cfg, log_path, state["step"], clock(), progress, logs, int(dropped))
-            if time.perf_counter() - last_save > CHECKPOINT_S:
+                for name, (low, high, meaning) in HEALTH.items() if progress > 1 / 3 else ():
+                    if name in logs and name not in warned and not low <= logs[name] <= high:
+                        warned.add(name)
+                        print(f"  warning: {name} is {logs[name]:.3g}: {meaning}")
+            if seconds - last_save > CHECKPOINT_S:
                 save()
-                last_save = time.perf_counter()
+                last_save = seconds
     finally:
         signal.signal(signal.SIGINT, handler)
         meter.stop()
     save()
-    if stop.is_set():
+    if int(streak) >= PATIENCE:
+        raise Diverged(f"the last {int(streak)} steps had no finite loss or gradient; {checkpoint} "
+                       "holds the last good weights. Likely causes: learning rates too high (try a "
+                       "third of --lr_grid and --lr_net), half precision (--amp off), broken poses")
+    if is_stopped:
         raise UserError(f"stopped at step {state['step']}; add --resume to go on")
     state["seconds"] = clock()
     return model, state, meter
@@ -1464,7 +1586,7 @@ def fit_codes(model, scene: Scene, photos: Tensor, codes: Tensor | None, steps: 
 
 def validate(model, scene: Scene, photos: Tensor, codes: Tensor | None) -> tuple[Tensor, float]:
     """Codes fitted a little further and PSNR, both on left halves of photos (B,): leaks nothing."""
-    codes = fit_codes(model, scene, photos, codes, 40, "half", 32)
+    codes = fit_codes(model, scene, photos, codes, 20, "half", 32)
     gen = torch.Generator(scene.rgb.device).manual_seed(1)
     pixel = pixels_of_each([half_pixels(scene, i, True) for i in photos.tolist()], 256, gen)
     errors = []
@@ -1537,20 +1659,20 @@ def evaluate(model, scene: Scene, cfg: Config, lpips: LPIPS | None) -> dict:
 def toy_truth(model, scene: Scene) -> dict:
     """What only a synthetic scene can tell; None where the model has no such part. sdf_error: mean
     |s - s_true| within 0.05 of visible surfaces, scene units. mask_iou, _static: M > 0.5 against
-    the true occluders over all training photos, and mean M on all other pixels."""
+    the true occluders over every fifth training pixel, and mean M on all others."""
     raw, dev = scene.raw, scene.rgb.device
     found = dict.fromkeys(("sdf_error", "mask_iou", "mask_static"))
     has_sdf, surface, mask, occluder = hasattr(model, "sdf"), [], [], []
     for i in scene.photos(False)[:, None]:
         span = slice(*scene.start[int(i):int(i) + 2].tolist())
-        pixel = torch.arange(span.stop - span.start, device=dev)
+        pixel = torch.arange(0, span.stop - span.start, 5, device=dev)  # (R,)
         rays = make_rays(scene, i.expand(len(pixel)), pixel)
-        depth = torch.as_tensor(raw["depth"][span]).to(dev, torch.float32)
+        depth = torch.as_tensor(raw["depth"][span][::5]).to(dev, torch.float32)  # (R,)
         if has_sdf:
-            surface.append(rays.at(depth[:, None])[depth.isfinite()][::7, 0])  # (P,3)
+            surface.append(rays.at(depth[:, None])[depth.isfinite()][:, 0])  # (P,3)
         if model.use_mask:
             mask.append(model.mask_of(rays, i).cpu())
-            occluder.append(torch.as_tensor(raw["occluder"][span]))
+            occluder.append(torch.as_tensor(raw["occluder"][span][::5]))
     if has_sdf:
         x, gen = torch.cat(surface), torch.Generator().manual_seed(0)
         x = x + 0.02 * torch.randn(x.shape, generator=gen).to(dev)  # (P,3) around the true surface
@@ -1577,8 +1699,8 @@ def extract_mesh(model: GeoNVS, resolution: int = 0) -> tuple[np.ndarray, np.nda
     n = resolution or min(2 * octree.resolution(octree.levels - 1), 512)
     line = torch.linspace(-1, 1, n + 1, device=cache.device)
     cached = F.interpolate(cache, size=(n + 1,) * 3, mode="trilinear", align_corners=True)[0, 0]
-    r = torch.cartesian_prod(line, line, line).norm(dim=1).reshape(cached.shape)  # (n+1,n+1,n+1)
-    near = (cached.abs() < 6 / cache.shape[-1]) & (r < 1)  # (n+1,n+1,n+1)
+    is_inside = line[:, None, None] ** 2 + line[:, None] ** 2 + line ** 2 < 1  # (n+1,n+1,n+1)
+    near = (cached.abs() < 6 / cache.shape[-1]) & is_inside  # (n+1,n+1,n+1)
     volume = torch.ones_like(cached)
     for index in torch.nonzero(near).split(2 ** 16) if near.any() else ():  # (P,3)
         volume[tuple(index.T)] = model.sdf(index * (2 / n) - 1.0)[0]
@@ -1664,7 +1786,7 @@ def panel(model, frames: list[tuple[str, dict]], height: int = 180) -> np.ndarra
     return np.concatenate([head, *rows])
 
 
-def finish(model, scene: Scene, cfg: Config, state: dict, meter: EnergyMeter, run: Path) -> dict:
+def finish(model, scene: Scene, cfg: Config, state: dict, energy: dict, run: Path) -> dict:
     """Scores a trained model and writes metrics.json, panel.png and mesh.ply below run."""
     scores = evaluate(model, scene, cfg, make_lpips(scene.rgb.device))
     frames = [(f"held out: {name}", frame) for name, frame in scores.pop("frames")[:3]]
@@ -1685,8 +1807,8 @@ def finish(model, scene: Scene, cfg: Config, state: dict, meter: EnergyMeter, ru
     metrics = dict(
         scene=scene.info["scene"], method=cfg.method, seed=cfg.seed, steps=state["step"],
         device=torch.cuda.get_device_name() if is_gpu else cpu,
-        **scores, train_seconds=state["seconds"], **meter.report(),
-        curve=state["curve"], dropped=state["dropped"],
+        **scores, train_seconds=state["seconds"], **energy,
+        curve=state["curve"], dropped=state["dropped"], processes=RANKS,
         rays_per_second=state["step"] * cfg.rays / max(state["seconds"], 1e-9),
         parameters=sum(p.numel() for p in model.parameters()),
         octree_cells=[len(c) for o in octrees[:1] for c in o.cells] or None,
@@ -1753,18 +1875,35 @@ def peak_rss() -> int:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
 
 
-# ---- 12 Experiments: speed against accuracy, what each piece buys --------------------------------
+# ---- 12 Experiments: speed against accuracy, what each piece buys, where methods fail ------------
 
-ABLATION = {  # one thing changed at a time
+PIECES = {  # of the method, one changed at a time
     "full": {}, "no GPL": dict(lam_gpl=0.0), "literal GPL": dict(gpl="literal"),
     "no mask": dict(mask="off"), "no appearance": dict(appearance="off"),
     "no SfM term": dict(lam_sfm=0.0), "no background": dict(background="off"),
     "no curvature": dict(lam_curv=0.0), "no Lipschitz": dict(lam_lps=0.0),
     "uniform sampling": dict(sampling="uniform"), "printed alpha": dict(alpha="printed"),
     "finite differences": dict(normals="fd"), "uniform grid": dict(grid="uniform"),
-    "one level less": dict(levels=-1), "one level more": dict(levels=1),
+    "half depth": dict(levels=-1), "double depth": dict(levels=1),  # more than the footprint's
 }
-STYLES = {"geonvsw": ("o-", "#0072B2"), "nerfw": ("s--", "#D55E00"), "hanerf": ("^:", "#009E73")}
+RIVALS = {"geonvsw": {}} | {
+    f"{method}{how}": dict(method=method, tuned=bool(how))
+    for method in ("nerfw", "hanerf") for how in ("", " tuned")}
+FRONT = {f"{rays} rays, {n} samples": dict(rays=rays, samples=n, bg_samples=n)
+         for rays in (256, 512, 1024) for n in (8, 16, 24)}
+CALM = dict(occluders=0.2, exposure=1.0, photos=24, pose_noise=0.0, amp="off")  # of a 64 px toy,
+STRESS = {  # and one knob turned at a time
+    "occluders": (0.0, 0.2, 0.4, 0.6), "exposure": (0.0, 1.0, 2.0), "photos": (6, 12, 24, 48),
+    "pose_noise": (0.0, 1.0, 2.0, 4.0), "amp": ("off", "on")}
+KNOB_UNITS = dict(occluders="share of occluders", exposure="exposure spread", amp="half precision",
+                  photos="training photos", pose_noise="pose noise, px")
+STRESS_METHODS = {piece: PIECES[piece] | dict(steps=500, rays=256) for piece in
+                  ("full", "no GPL", "literal GPL", "no mask", "no appearance")}
+STRESS_METHODS |= {method: RIVALS[f"{method} tuned"] | dict(minutes=0.4, steps=10 ** 6)
+                   for method in ("nerfw", "hanerf")}
+COLORS = "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#999999"
+FIGURES = ("psnr", "psnr_floor", "ssim", "sdf_error", "mask_iou", "mask_static", "octree_bytes",
+           "rays_per_second", "train_seconds", "energy_wh", "parameters")
 
 
 def read_metrics(run: Path) -> dict:
@@ -1773,14 +1912,54 @@ def read_metrics(run: Path) -> dict:
     return json.loads((run / "metrics.json").read_text())
 
 
-def run_once(given: dict, run: Path, arrays: dict | None = None) -> dict:
-    """Metrics of one training; a finished run is read, so that a matrix can go on."""
-    if (run / "metrics.json").exists():
-        return read_metrics(run)
+def run_once(given: dict, run: Path) -> dict:
+    """Metrics of one training; given may hold "toy", knobs of make_toy. What it prints goes to
+    log.txt. A finished run of the same settings is read; one that diverged is a result, too."""
+    toy, given = given.get("toy"), {k: v for k, v in given.items() if k != "toy"}
     cfg = make_config(given)
     check(cfg)
-    print(f"--- {run}", flush=True)
-    return execute(cfg, arrays if arrays is not None else find_scene(cfg), run)
+    if not (run / "metrics.json").exists() or read_metrics(run)["config"] != asdict(cfg):
+        run.mkdir(parents=True, exist_ok=True)
+        with open(run / "log.txt", "w") as log, contextlib.redirect_stdout(log):
+            try:
+                execute(cfg, data_prep.make_toy(**toy) if toy else find_scene(cfg), run)
+            except Diverged as error:
+                write_text(run / "metrics.json", json.dumps(
+                    dict(failed=str(error), method=cfg.method, curve=[], config=asdict(cfg))))
+    metrics = read_metrics(run)
+    said = metrics.get("failed") or "{psnr:.2f} dB, {train_seconds:.0f} s".format(**metrics)
+    print(f"{run}: {said}", flush=True)
+    return metrics
+
+
+def matrix(kind: str, rows: dict[str, dict], given: dict, seeds: int, workers: int = 1) -> dict:
+    """Metrics, a list over seeds, of every row (settings by name). workers: CPU processes that
+    train side by side, a thread each, which is faster than one after the other with all threads."""
+    find_scene(make_config(given))  # made once, before the processes start
+    folder = Path("runs") / kind
+    jobs = [(given | row | dict(seed=seed), folder / f"{name}-{seed}".replace(" ", "_"))
+            for name, row in rows.items() for seed in range(seeds)]
+    if workers == 1:
+        done = [run_once(*job) for job in jobs]
+    else:
+        spawn = get_context("spawn")
+        with ProcessPoolExecutor(workers, spawn, torch.set_num_threads, (1,)) as pool:
+            done = list(pool.map(run_once, *zip(*jobs)))
+    return {name: done[i * seeds:(i + 1) * seeds] for i, name in enumerate(rows)}
+
+
+def has_failed(metrics: dict) -> bool:
+    """Did a run diverge, or end below a picture of one colour?"""
+    return "failed" in metrics or metrics["psnr"] < metrics["psnr_mean_color"]
+
+
+def table_line(name: dict, metrics: list[dict]) -> dict:
+    """A line of a table: mean and spread over seeds. Failures count, in a column of their own."""
+    cells = [m["octree_cells"] for m in metrics if m.get("octree_cells")]
+    line = name | dict(runs=len(metrics), failures=sum(map(has_failed, metrics)),
+                       cells=float(np.mean([sum(c) for c in cells])) if cells else None)
+    pairs = ((key, summary(metrics, key)) for key in FIGURES)
+    return line | {k: v for key, pair in pairs for k, v in zip((key, key + "_std"), pair)}
 
 
 def write_table(path: Path, rows: list[dict]) -> None:
@@ -1789,6 +1968,7 @@ def write_table(path: Path, rows: list[dict]) -> None:
         return "" if v is None else f"{v:.5g}" if isinstance(v, float) else str(v)
     lines = [list(rows[0])] + [[cell(v) for v in row.values()] for row in rows]
     write_text(path, "".join(",".join(line) + "\n" for line in lines))
+    print(f"wrote {path}")
 
 
 def plotting():
@@ -1805,12 +1985,6 @@ def save_figure(figure, path: Path) -> None:
     print(f"wrote {path}")
 
 
-def spreads(metrics: list[dict], *keys: str) -> dict:
-    """Mean and spread over runs of several figures, as cells of a table."""
-    pairs = ((key, summary(metrics, key)) for key in keys)
-    return {name: v for key, (mean, std) in pairs for name, v in ((key, mean), (key + "_std", std))}
-
-
 def reached(curve: list[dict], level: float, unit: str) -> float | None:
     """Seconds or watt-hours at which a curve first reaches a PSNR, log-interpolated, or None."""
     for a, b in zip([None] + curve, curve):
@@ -1822,27 +1996,29 @@ def reached(curve: list[dict], level: float, unit: str) -> float | None:
     return None
 
 
-def by_method(metrics: list[dict]) -> dict[str, list[dict]]:
-    groups = {method: [m for m in metrics if m["method"] == method] for method in METHODS}
-    return {method: mine for method, mine in groups.items() if mine}
+def pareto(points: list[tuple]) -> list[tuple]:
+    """Of points (cost, quality) those that no other beats at the same cost or less."""
+    return [(x, y) for x, y in points if not any(a <= x and b > y for a, b in points)]
 
 
-def plot_curves(axis, metrics: list[dict], unit: str, xlabel: str) -> None:
-    """PSNR over seconds or watt-hours: a line for each method's mean, a band from worst to best."""
-    for method, mine in by_method(metrics).items():
-        curves = [m["curve"] for m in mine if m["curve"]]
+def plot_curves(axis, groups: dict[str, list[dict]], unit: str, xlabel: str) -> None:
+    """PSNR over seconds or watt-hours: mean and range over seeds; rings mark the Pareto front."""
+    points = []
+    for i, (name, metrics) in enumerate(groups.items()):
+        curves = [m["curve"] for m in metrics if m["curve"]]
         n = min(map(len, curves), default=0)
         if n and all(c[0][unit] is not None for c in curves):
             x, y = (np.array([[p[k] for p in c[:n]] for c in curves]) for k in (unit, "psnr"))
-            line, color = STYLES[method]
-            label = f"{method} ({len(curves)} seeds)"
-            axis.plot(x.mean(0), y.mean(0), line, color=color, ms=4, label=label)
-            axis.fill_between(x.mean(0), y.min(0), y.max(0), color=color, alpha=0.2)
-    if axis.lines:
+            style = dict(color=COLORS[i % 8], marker="os^Dv"[i % 5], ls=("-", "--", ":")[i % 3])
+            axis.plot(x.mean(0), y.mean(0), label=f"{name} ({len(curves)} seeds)", ms=4, **style)
+            axis.fill_between(x.mean(0), y.min(0), y.max(0), color=COLORS[i % 8], alpha=0.2)
+            points += zip(x.mean(0), y.mean(0))
+    if points:
+        axis.plot(*zip(*pareto(points)), "o", mfc="none", mec="black", ms=9, label="Pareto front")
+        floor, _ = summary([m for metrics in groups.values() for m in metrics], "psnr_floor")
+        axis.axhline(floor, color="grey", lw=1, label="trivial predictor")
         axis.set_xscale("log")
-        floor, _ = summary(metrics, "psnr_floor")
-        axis.axhline(floor, color="grey", lw=1, ls="-.", label="trivial predictor")
-        axis.legend()
+        axis.legend(fontsize=8)
     else:
         axis.text(0.5, 0.5, f"no {unit} in these runs\n(--curve records, energy needs a counter)",
                   ha="center", va="center", transform=axis.transAxes)
@@ -1850,56 +2026,88 @@ def plot_curves(axis, metrics: list[dict], unit: str, xlabel: str) -> None:
     axis.grid(alpha=0.3)
 
 
-def chart(given: dict, runs: list[str], seeds: int) -> None:
-    """chart.png: PSNR over seconds and over watt-hours, one curve a method; chart.csv: a table."""
-    plt = plotting()
-    if not runs:
-        given = dict(minutes=2.0, steps=10 ** 7, curve=True) | given
-        stem = f"runs/chart-{scene_name(make_config(given))}"
-        for seed, method in itertools.product(range(seeds), METHODS):
-            runs = [*runs, f"{stem}-{method}-{seed}"]
-            run_once(given | dict(method=method, seed=seed), Path(runs[-1]))
-    metrics, rows = [read_metrics(Path(run)) for run in runs], []
-    for method, mine in by_method(metrics).items():
-        row = dict(method=method, runs=len(mine)) | spreads(
-            mine, "psnr", "ssim", "psnr_floor", "train_seconds", "energy_wh", "rays_per_second",
-            "parameters")
-        for level in range(14, 32):
-            for unit in ("seconds", "wh"):
-                hits = [reached(m["curve"], level, unit) for m in mine]
-                row[f"{unit}_to_{level}dB"] = None if None in hits else float(np.mean(hits))
+def chart(kind: str, groups: dict[str, list[dict]]) -> None:
+    """<kind>.png: PSNR over seconds and watt-hours, a curve a row; <kind>.csv: the table, with time
+    and energy to PSNR levels, and to where each baseline's better row ends, over what that took."""
+    plt, rows, goals, spent = plotting(), [], {f"{n}dB": float(n) for n in range(14, 32)}, {}
+    for rival in ("nerfw", "hanerf"):
+        ends = [[m["curve"][-1] for m in metrics] for name, metrics in groups.items()
+                if name.startswith(rival) and all(m["curve"] for m in metrics)]
+        if ends:
+            best = max(ends, key=lambda points: summary(points, "psnr")[0])
+            goals[f"{rival}_end"] = summary(best, "psnr")[0]
+            spent |= {(unit, f"{rival}_end"): summary(best, unit)[0] for unit in ("seconds", "wh")}
+    for name, metrics in groups.items():
+        row, curves = table_line(dict(row=name), metrics), [m["curve"] for m in metrics]
+        for unit, (goal, level) in itertools.product(("seconds", "wh"), goals.items()):
+            hits = [reached(curve, level, unit) for curve in curves]
+            row[f"{unit}_to_{goal}"] = mean = None if None in hits else float(np.mean(hits))
+            if (unit, goal) in spent:
+                theirs = spent[unit, goal]
+                row[f"{unit}_ratio_{goal}"] = mean / theirs if mean and theirs else None
         rows.append(row)
-    figure, axes = plt.subplots(1, 2, figsize=(11, 4.2), sharey=True)
-    plot_curves(axes[0], metrics, "seconds", "training time, s")
-    plot_curves(axes[1], metrics, "wh", "energy, Wh")
-    figure.suptitle(f"{metrics[0]['scene']}: speed against accuracy ({metrics[0]['device']})")
-    save_figure(figure, Path("chart.png"))
-    write_table(Path("chart.csv"), rows)
+    figure, axes = plt.subplots(1, 2, figsize=(12, 4.5), sharey=True)
+    plot_curves(axes[0], groups, "seconds", "training time, s")
+    plot_curves(axes[1], groups, "wh", "energy, Wh")
+    some = next(m for metrics in groups.values() for m in metrics if "failed" not in m)
+    figure.suptitle(f"{some['scene']}: speed against accuracy ({some['device']})")
+    save_figure(figure, Path(f"{kind}.png"))
+    write_table(Path(f"{kind}.csv"), rows)
 
 
-def ablation(given: dict, seeds: int) -> None:
-    """What each piece buys: ABLATION's rows, mean and spread, as ablation.csv and png."""
-    plt, rows, scene = plotting(), [], scene_name(make_config(given))
-    for name, change in ABLATION.items():
-        if "levels" in change:
-            change = dict(levels=levels + change["levels"])
-        stem = Path("runs") / f"ablation-{scene}-{name.replace(' ', '_')}"
-        metrics = [run_once(given | change | dict(seed=i), Path(f"{stem}-{i}"))
-                   for i in range(seeds)]
-        cells = metrics[0]["octree_cells"]
-        levels = len(cells) if name == "full" else levels
-        rows.append(dict(row=name, runs=seeds, cells=sum(cells)) | spreads(
-            metrics, "psnr", "ssim", "sdf_error", "mask_iou", "mask_static", "octree_bytes",
-            "rays_per_second", "train_seconds"))
-    write_table(Path("ablation.csv"), rows)
-    names, mean, std = zip(*[(r["row"], r["psnr"], r["psnr_std"]) for r in rows])
-    figure, axis = plt.subplots(figsize=(8, 0.35 * len(rows) + 1))
-    axis.barh(names, mean, xerr=std, color=STYLES["geonvsw"][1])
-    axis.axvline(mean[0], color="black", lw=1)
-    axis.invert_yaxis()
-    axis.set(xlabel="PSNR, dB (bar: spread over seeds)", xlim=(min(mean) - 1, None),
-             title=f"{scene}: one piece changed at a time")
+def ablation(given: dict, seeds: int, workers: int) -> None:
+    """What each piece buys, the octree's depth and shape among them: ablation.csv and png."""
+    plt, cfg = plotting(), make_config(given)
+    levels = cfg.levels or levels_for_footprint(float(find_scene(cfg)["footprint"]))
+    rows = {name: row | ({"levels": levels + row["levels"]} if "levels" in row else {})
+            for name, row in PIECES.items()}
+    groups = matrix(f"ablation-{scene_name(cfg)}", rows, given, seeds, workers)
+    table = [table_line(dict(row=name), metrics) for name, metrics in groups.items()]
+    write_table(Path("ablation.csv"), table)
+    shown = dict(psnr="PSNR, dB", sdf_error="SDF error, radii", mask_iou="mask IoU",
+                 octree_bytes="octree, bytes", rays_per_second="training, rays/s")
+    figure, axes = plt.subplots(1, len(shown), figsize=(15, 0.33 * len(table) + 1), sharey=True)
+    for axis, (key, label) in zip(axes, shown.items()):
+        mean, std = ([math.nan if r[k] is None else r[k] for r in table]
+                     for k in (key, key + "_std"))
+        axis.barh([r["row"] for r in table], mean, xerr=std, color=COLORS[0])
+        axis.axvline(mean[0], color="black", lw=1)
+        axis.set(xlabel=label, xlim=(np.nanmin(mean) - 1, None) if key == "psnr" else None)
+    axes[0].invert_yaxis()
+    figure.suptitle(f"{scene_name(cfg)}: one piece changed at a time, {seeds} seeds")
     save_figure(figure, Path("ablation.png"))
+
+
+def stress(given: dict, seeds: int, workers: int) -> None:
+    """Where methods fail: stress.csv and png, over one knob of a small toy at a time."""
+    plt, names, rows = plotting(), {}, {}
+    for knob, values in STRESS.items():
+        for value, (method, settings) in itertools.product(values, STRESS_METHODS.items()):
+            toy = CALM | {knob: value}
+            name = "-".join(map(str, (method, *toy.values())))  # knobs share their calm cell
+            names[knob, value, method] = name
+            rows[name] = settings | dict(amp=toy.pop("amp"), toy=toy | dict(size=64))
+    groups = matrix("stress", rows, given, seeds, workers)
+    table = [table_line(dict(knob=knob, value=value, method=method), groups[name])
+             for (knob, value, method), name in names.items()]
+    write_table(Path("stress.csv"), table)
+    figure, axes = plt.subplots(2, len(STRESS), figsize=(16, 7), sharey="row")
+    for pair, (knob, values) in zip(axes.T, STRESS.items()):
+        for i, method in enumerate(STRESS_METHODS):
+            mine = [r for r in table if (r["knob"], r["method"]) == (knob, method)]
+            for axis, key in zip(pair, ("psnr", "sdf_error")):
+                mean, std = ([math.nan if r[k] is None else r[k] for r in mine]
+                             for k in (key, key + "_std"))
+                axis.errorbar(range(len(values)), mean, std, color=COLORS[i], marker="os^Dv<>"[i],
+                              ms=4, capsize=2, label=method)
+                axis.set_xticks(range(len(values)), values)
+        failures = sum(r["failures"] for r in table if r["knob"] == knob)
+        pair[0].set_title(f"{failures} failed runs", fontsize=9)
+        pair[1].set_xlabel(KNOB_UNITS[knob])
+    axes[0, 0].set_ylabel("PSNR, dB")
+    axes[1, 0].set_ylabel("SDF error, radii")
+    axes[0, 0].legend(fontsize=7)
+    save_figure(figure, Path("stress.png"))
 
 
 # ---- 13 Command line -----------------------------------------------------------------------------
@@ -1928,24 +2136,27 @@ def make_parser() -> argparse.ArgumentParser:
     add("--resume", action="store_true", help="go on from the run's checkpoint")
     add("--chart", nargs="*", metavar="RUN", help="speed against accuracy: of finished runs, or of "
         "the three methods trained now")
+    add("--front", action="store_true", help="quality against speed of the method's own knobs")
     add("--ablation", action="store_true", help="what each piece buys")
-    add("--seeds", type=int, help="seeds for --chart and --ablation [3]")
+    add("--stress", action="store_true", help="where methods fail: the toy's knobs, one by one")
+    add("--seeds", type=int, help="seeds of --chart, --front, --ablation and --stress [3]")
     add("--render", choices=("orbit", "appearance"), help="write a short film of a finished run")
     return parser
 
 
 def pick_device(name: str) -> torch.device:
     if name == "auto":
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+        name = "cuda" if torch.cuda.is_available() else "cpu"
     try:
         device = torch.device(name)
     except RuntimeError:
         raise UserError(f"--device {name} is unknown: use auto, cpu, cuda or cuda:N") from None
     if device.type not in ("cpu", "cuda"):
         raise UserError(f"--device {name} is not supported: use auto, cpu, cuda or cuda:N")
-    if device.type == "cuda" and not torch.cuda.is_available():
-        raise UserError("--device cuda: torch finds no GPU here: use cpu, or a torch with CUDA")
-    return device
+    is_there = torch.cuda.is_available() and LOCAL_RANK < torch.cuda.device_count()
+    if device.type == "cuda" and not is_there:
+        raise UserError("--device cuda: no GPU for this process: use cpu, or a torch with CUDA")
+    return torch.device("cuda", LOCAL_RANK) if device.type == "cuda" and RANKS > 1 else device
 
 
 def scene_name(cfg: Config) -> str:
@@ -1980,7 +2191,7 @@ def check(cfg: Config) -> None:
     for name, value in asdict(cfg).items():
         if isinstance(value, (int, float)) and not 0 <= value < 2 ** 63:
             raise UserError(f"--{name} {value} makes no sense: use a number >= 0")
-    least = dict(samples=2, bg_samples=2, rays=2, mask_px=16) | dict.fromkeys(
+    least = dict(samples=2, bg_samples=2, rays=2 * RANKS, mask_px=16) | dict.fromkeys(
         ("photos", "steps", "downscale", "channels", "hidden", "mask_every", "bg_levels"), 1)
     least |= dict(rays=1024) if cfg.method == "hanerf" else {}  # its encoder reads the grid of rays
     for name, bound in least.items():
@@ -2000,7 +2211,8 @@ def execute(cfg: Config, arrays, run: Path, saved: dict | None = None) -> dict:
     print(f"{cfg.method} on {scene.info['scene']}: {len(scene.wh)} photos "
           f"({len(scene.photos(True))} held out), {len(scene.rgb):,} pixels; {device}; {run}/")
     model, state, meter = train(cfg, scene, run, saved)
-    metrics = finish(model, scene, cfg, state, meter, run)
+    energy = meter.report()  # of all processes
+    metrics = agreed(RANK or finish(model, scene, cfg, state, energy, run))
     shown = ("psnr", "psnr_floor", "ssim", "lpips", "sdf_error", "mask_iou", "mask_static",
              "train_seconds", "energy_wh")
     print("".join(f"  {k} {metrics[k]:.4g}" for k in shown if metrics.get(k) is not None))
@@ -2020,29 +2232,53 @@ def render_film(kind: str, run: Path, given: dict) -> None:
 
 
 def make_config(given: dict) -> Config:
-    """Config's defaults, then the scene's settings, the method's published ones, and flags."""
-    scene = {} if given.get("data") else SCENES.get(given.get("scene", "toy"), {})
-    return Config(**scene | METHODS[given.get("method", "geonvsw")][1] | given)
+    """Config's defaults, the scene's settings, the method's, the preset's factors, then flags."""
+    chosen = {} if given.get("data") else dict(SCENES.get(given.get("scene", "toy"), {}))
+    _, published, tuned = METHODS[given.get("method", "geonvsw")]
+    chosen |= published | (tuned if given.get("tuned") else {})
+    for name, factor in PRESETS[given.get("preset", "default")].items():
+        chosen[name] = round(chosen.get(name, getattr(Config, name)) * factor)
+    return Config(**chosen | given)
 
 
 def main(argv: list[str] | None = None) -> None:
     given = vars(make_parser().parse_args(argv))
-    names = ("resume", "render", "chart", "ablation", "seeds")
+    names = ("resume", "render", "chart", "front", "ablation", "stress", "seeds")
     commands = {k: given.pop(k) for k in names if k in given}
     cfg, seeds = make_config(given), commands.get("seeds", 3)
     check(cfg)
     device = pick_device(cfg.device)
+    workers = 1 if device.type == "cuda" else os.cpu_count()
+    timed = dict(minutes=2.0, steps=10 ** 6, curve=True) | given  # one at a time, all threads
+    if RANKS > 1:
+        if device.type == "cuda":
+            torch.cuda.set_device(device)
+        dist.init_process_group("cpu:gloo,cuda:nccl" if device.type == "cuda" else "gloo")
+        sys.stdout = open(os.devnull, "w") if RANK else sys.stdout
     run = Path("runs") / (cfg.name or f"{scene_name(cfg)}-{cfg.method}-{cfg.seed}")
-    if "chart" in commands:
-        chart(given, commands["chart"], seeds)
+    if commands.get("chart"):
+        runs = [read_metrics(Path(run)) for run in commands["chart"]]
+        names = [m["method"] + " tuned" * m["config"]["tuned"] for m in runs]
+        chart("chart", {name: [m for m, n in zip(runs, names) if n == name]
+                        for name in RIVALS if name in names})
+    elif "chart" in commands:
+        chart("chart", matrix(f"chart-{scene_name(cfg)}", RIVALS, timed, seeds))
+    elif "front" in commands:
+        chart("front", matrix(f"front-{scene_name(cfg)}", FRONT, timed, seeds, workers))
     elif "ablation" in commands:
-        ablation(given, seeds)
+        ablation(given, seeds, workers)
+    elif "stress" in commands:
+        stress(given, seeds, workers)
     elif "render" in commands:
         render_film(commands["render"], run, given)
     else:
         saved = read_checkpoint(run / "checkpoint.pt", device) if "resume" in commands else None
         cfg = Config(**saved["config"] | given) if saved else cfg
-        execute(cfg, find_scene(cfg), run, saved)
+        try:
+            arrays = RANK or find_scene(cfg)
+        finally:  # the others read what the first one made, or fail as it did
+            agreed(None)
+        execute(cfg, find_scene(cfg) if RANK else arrays, run, saved)
 
 
 def run_command_line(entry) -> None:
@@ -2061,3 +2297,5 @@ def run_command_line(entry) -> None:
 
 if __name__ == "__main__":
     run_command_line(main)
+    if RANKS > 1:
+        dist.destroy_process_group()
