@@ -4375,10 +4375,34 @@ def test_every_scene_and_method_has_settings_that_pass_the_check(given):
     g.check(g.make_config(given))
 
 
-def test_readme_lists_the_same_deviations_as_the_docstring():
+NOTEBOOK = json.loads(Path(g.__file__).with_name("tutorial.ipynb").read_text())["cells"]
+CODE_CELLS = [c for c in NOTEBOOK if c["cell_type"] == "code"]
+NOTEBOOK_TEXT = "\n".join("".join(c["source"]) for c in NOTEBOOK if c["cell_type"] == "markdown")
+
+
+def test_readme_and_notebook_list_the_same_deviations_as_the_docstring():
     readme = Path(g.__file__).with_name("README.md").read_text()
-    here, there = (re.findall(r"^[ -]*`?\[(D\d+)\]`? +(.+)$", text, re.M) for text in (g.__doc__, readme))
-    assert here and here == there
+    here, *there = (re.findall(r"^[ -]*`?\[(D\d+)\]`? +(.+)$", text, re.M)
+                    for text in (g.__doc__, readme, NOTEBOOK_TEXT))
+    assert here and there == [here, here]
+
+
+def test_notebook_shows_every_numbered_equation_of_the_paper():
+    assert re.findall(r"\\tag\{(\d)\}", NOTEBOOK_TEXT) == list("12345")
+
+
+def test_notebook_defines_no_name_that_the_code_defines():
+    code = "\n".join("".join(c["source"]) for c in CODE_CELLS)
+    ours = set(re.findall(r"^ *(?:def|class) (\w+)", code, re.M))
+    assert "show" in ours and not ours & ({*dir(g)} | {*dir(data_prep)})
+
+
+def test_notebook_lies_here_as_one_clean_run_left_it():
+    assert [c["execution_count"] for c in CODE_CELLS] == list(range(1, len(CODE_CELLS) + 1))
+    outputs = [o for c in CODE_CELLS for o in c["outputs"]]
+    assert any("image/png" in o.get("data", {}) for o in outputs)
+    assert not [o for o in outputs if o["output_type"] == "error" or o.get("name") == "stderr"]
+    assert Path(g.__file__).with_name("tutorial.ipynb").stat().st_size < 1.5e6
 
 
 def test_deviations_listed_in_the_docstring_are_those_tagged_in_the_code():
