@@ -147,7 +147,7 @@ PRESETS = {"fast": dict(steps=0.5, samples=0.5, bg_samples=0.5), "default": {},
 class Scene(NamedTuple):
     """The arrays of a scene file (data_prep.py documents them) as tensors on the device."""
 
-    rgb: Tensor  # (N,3) uint8, all pixels of all photos, photo after photo
+    rgb: Tensor  # (N,3) uint8, all pixels of all photos; stays on the host if too large for a GPU
     start: Tensor  # (I+1,) first pixel of each photo
     wh: Tensor  # (I,2) width, height in px
     K: Tensor  # (I,4) fx fy cx cy in px
@@ -173,11 +173,14 @@ def load_scene(source: dict | Path, device="cpu", mask_px: int = 96) -> Scene:
     thumbs = torch.as_tensor(np.stack(thumbs)).permute(0, 3, 1, 2).contiguous().to(device)
     kinds = dict(rgb=torch.uint8, start=torch.long, wh=torch.long, is_test=torch.bool)
     arrays = {k: torch.as_tensor(raw[k]).to(device, kinds.get(k, torch.float32))
-              for k in Scene._fields[:8]}
+              for k in Scene._fields[1:8]}
+    fits = thumbs.device.type == "cpu" or raw["rgb"].nbytes < torch.cuda.mem_get_info(device)[0] / 2
+    rgb = torch.as_tensor(raw["rgb"])
+    arrays["rgb"] = rgb.to(device) if fits else rgb.pin_memory()
     return Scene(**arrays, thumbs=thumbs, raw=raw, info=json.loads(str(raw["info"])))
 
 
-CHUNK = 4096  # rays or points evaluated at once outside training
+CHUNK = 4096  # rays or points evaluated at once outside training, on a CPU
 
 
 class Rays(NamedTuple):
@@ -207,7 +210,8 @@ def make_rays(scene: Scene, img: Tensor, pixel: Tensor) -> Rays:
     uv = torch.stack([pixel % w, pixel // w], 1) + 0.5  # (R,2) px
     c2w = scene.c2w[img]  # (R,3,4)
     d = (c2w[:, :, :3] @ pixel_directions(uv, scene.K[img])[:, :, None])[:, :, 0]  # (R,3)
-    rgb = scene.rgb[scene.start[img] + pixel].float() / 255  # (R,3)
+    at = (scene.start[img] + pixel).to(scene.rgb.device)  # (R,)
+    rgb = scene.rgb[at].to(d.device).float() / 255  # (R,3)
     return Rays(c2w[:, :, 3], d, scene.near[img], img, uv / torch.stack([w, h], 1), rgb)
 
 
@@ -771,7 +775,7 @@ class GeoNVS(Method):
     def __init__(self, cfg: Config, scene: Scene, gen: torch.Generator | None = None):
         super().__init__()
         self.cfg, self.scene, self.step, self.refined = cfg, scene, 0, 0
-        self.use_mask, dev = cfg.mask != "off", scene.rgb.device
+        self.use_mask, dev = cfg.mask != "off", scene.c2w.device
         inside = scene.points.norm(dim=1) < 1
         self.sfm = scene.points[inside]  # (K,3)
         levels = cfg.levels or levels_for_footprint(float(scene.raw["footprint"]))
@@ -1043,7 +1047,7 @@ class NeRFW(Method):
         is_small = reach.numel() < 1e7  # what torch.quantile takes
         self.far = float(reach.flatten().double().quantile(0.999) if is_small else reach.max())
         self.make_heads(len(scene.wh))
-        self.to(scene.rgb.device)
+        self.to(scene.c2w.device)
 
     def make_heads(self, photos: int) -> None:
         half = self.cfg.hidden // 2
@@ -1371,16 +1375,27 @@ def restore(saved: dict, path: Path, model, optimizer, gen: torch.Generator) -> 
                         "made with") from None
 
 
+LOSS_SCALE = 2.0 ** 10  # lifts small gradients above what float16 can hold
+
+
+def half_dtype(device: torch.device) -> torch.dtype:
+    """What mixed precision computes in: bfloat16, or float16 on GPUs that have no other."""
+    lacks = device.type == "cuda" and torch.cuda.get_device_capability(device) < (8, 0)
+    return torch.float16 if lacks else torch.bfloat16
+
+
 def training_step(model: Method, optimizer, photos: Tensor, state: dict, progress: float,
                   gen: torch.Generator) -> tuple[dict, Tensor]:
     """One update. Returns the logs, and 1 if a loss or gradient that is not finite made it void."""
     cfg, device = model.cfg, photos.device
     rays, pick = model.batch(photos, gen)
     is_half = cfg.amp == "on" or cfg.amp == "auto" and device.type == "cuda"
-    with torch.autocast(device.type, torch.bfloat16, enabled=is_half):
+    half = half_dtype(device)
+    with torch.autocast(device.type, half, enabled=is_half):
         loss, logs = model.losses(rays, pick, progress, gen)
+    scale = LOSS_SCALE if is_half and half == torch.float16 else 1.0
     optimizer.zero_grad()
-    loss.backward()
+    (scale * loss).backward()
     set_learning_rate(optimizer, state["step"], progress)
     parameters = [p for group in optimizer.param_groups for p in group["params"]]
     grads = [p.grad for p in parameters if p.grad is not None]
@@ -1389,6 +1404,7 @@ def training_step(model: Method, optimizer, photos: Tensor, state: dict, progres
         dist.all_reduce(flat)
         nn.utils.vector_to_parameters(flat.div_(RANKS), grads)
     norm = nn.utils.get_total_norm(grads)
+    optimizer.grad_scale = None if scale == 1 else torch.full((), scale, device=device)
     optimizer.found_inf = (~torch.isfinite(norm + loss.detach())).float()
     optimizer.step()
     model.maintain(state["step"], progress, optimizer)
@@ -1400,7 +1416,7 @@ def train(cfg: Config, scene: Scene, run: Path, saved: dict | None = None):
     """Trains until cfg.steps or cfg.minutes; writes log.jsonl and checkpoint.pt below run. saved: a
     checkpoint to go on from. Returns model, state (step, seconds, joules, curve), meter. Evaluation
     moments are outside the timed and metered window."""
-    device = scene.rgb.device
+    device = scene.c2w.device
     torch.set_flush_denormal(True)  # vanishing weights would otherwise slow a CPU down
     torch.manual_seed(cfg.seed)
     gen = torch.Generator(device).manual_seed(cfg.seed)
@@ -1556,7 +1572,7 @@ def make_lpips(device) -> LPIPS | None:
 def half_pixels(scene: Scene, photo: int, left: bool) -> Tensor:
     """Pixel numbers of the columns left of w // 2, or from there on. [D12]"""
     w, h = scene.wh[photo].tolist()
-    pixel = torch.arange(w * h, device=scene.rgb.device)
+    pixel = torch.arange(w * h, device=scene.c2w.device)
     return pixel[(pixel % w < w // 2) == left]
 
 
@@ -1570,7 +1586,7 @@ def fit_codes(model, scene: Scene, photos: Tensor, codes: Tensor | None, steps: 
               rays_per_photo: int = 64) -> Tensor:
     """Appearance codes (B,A) of unseen photos (B,): Adam on random rays of the left halves. [D12]
     Starts from codes, or from the mean code of the training photos. The scene stays untouched."""
-    gen, n = torch.Generator(scene.rgb.device).manual_seed(0), rays_per_photo
+    gen, n = torch.Generator(scene.c2w.device).manual_seed(0), rays_per_photo
     if codes is None:
         codes = model.codes()[~scene.is_test].mean(0).expand(len(photos), -1)  # (B,A)
     codes = codes.detach().clone().requires_grad_()
@@ -1597,7 +1613,7 @@ def fit_codes(model, scene: Scene, photos: Tensor, codes: Tensor | None, steps: 
 def validate(model, scene: Scene, photos: Tensor, codes: Tensor | None) -> tuple[Tensor, float]:
     """Codes fitted a little further and PSNR, both on left halves of photos (B,): leaks nothing."""
     codes = fit_codes(model, scene, photos, codes, 20, "half", 32)
-    gen = torch.Generator(scene.rgb.device).manual_seed(1)
+    gen = torch.Generator(scene.c2w.device).manual_seed(1)
     pixel = pixels_of_each([half_pixels(scene, i, True) for i in photos.tolist()], 256, gen)
     errors = []
     for img, part, code in zip(photos, pixel.split(256), codes):
@@ -1608,14 +1624,19 @@ def validate(model, scene: Scene, photos: Tensor, codes: Tensor | None) -> tuple
     return codes, (-10 * torch.log10(torch.stack(errors))).mean().item()
 
 
+RAY_BYTES = 2 ** 18  # memory that a ray takes in rendering, generously
+
+
 @torch.no_grad()
 def render_photo(model, scene: Scene, photo: int, code: Tensor) -> dict[str, np.ndarray]:
     """A photo's view under an appearance code (A,): arrays (H,W,...) by name of render_rays. Adds
     `mask` (H,W): what the mask network thinks of the real photo, and `truth` (H,W,3)."""
     w, h = scene.wh[photo].tolist()
-    img = torch.tensor([photo], device=scene.rgb.device)
-    parts = []
-    for pixel in torch.arange(w * h, device=img.device).split(CHUNK):
+    img = torch.tensor([photo], device=scene.c2w.device)
+    parts, n = [], CHUNK
+    if img.is_cuda:
+        n = int(np.clip(torch.cuda.mem_get_info()[0] // RAY_BYTES, CHUNK, 2 ** 18))
+    for pixel in torch.arange(w * h, device=img.device).split(n):
         rays = make_rays(scene, img.expand(len(pixel)), pixel)
         out = model.render(rays, code.expand(len(pixel), -1))
         out |= dict(mask=model.mask_of(rays, img), truth=rays.rgb)
@@ -1655,14 +1676,18 @@ def summary(rows: list[dict], key: str) -> tuple[float | None, float | None]:
 
 def evaluate(model, scene: Scene, cfg: Config, lpips: LPIPS | None) -> dict:
     """Scores of the test photos by the half-image protocol [D12], per photo and on average."""
-    photos, rows, frames = scene.photos(True), [], []  # (B,)
+    photos, rows, frames, seconds = scene.photos(True), [], [], []  # (B,)
     codes = fit_codes(model, scene, photos, None, 128, cfg.protocol) if len(photos) else []  # (B,A)
     for photo, code in zip(photos.tolist(), codes):
+        begin = time.perf_counter()
         name, frame = str(scene.raw["name"][photo]), render_photo(model, scene, photo, code)
-        rows.append(dict(name=name) | score(frame, lpips, scene.rgb.device))
+        seconds.append(time.perf_counter() - begin)
+        rows.append(dict(name=name) | score(frame, lpips, scene.c2w.device))
         frames.append((name, frame))
     keys = ("psnr", "psnr_floor", "psnr_mean_color", "ssim", "lpips")
-    return {k: summary(rows, k)[0] for k in keys} | dict(per_image=rows, frames=frames)
+    fps = 1 / float(np.median(seconds)) if seconds else None
+    means = {k: summary(rows, k)[0] for k in keys}
+    return means | dict(per_image=rows, frames_per_second=fps, frames=frames)
 
 
 @torch.no_grad()
@@ -1670,7 +1695,7 @@ def toy_truth(model, scene: Scene) -> dict:
     """What only a synthetic scene can tell; None where the model has no such part. sdf_error: mean
     |s - s_true| within 0.05 of visible surfaces, scene units. mask_iou, _static: M > 0.5 against
     the true occluders over every fifth training pixel, and mean M on all others."""
-    raw, dev = scene.raw, scene.rgb.device
+    raw, dev = scene.raw, scene.c2w.device
     found = dict.fromkeys(("sdf_error", "mask_iou", "mask_static"))
     has_sdf, surface, mask, occluder = hasattr(model, "sdf"), [], [], []
     for i in scene.photos(False)[:, None]:
@@ -1798,7 +1823,7 @@ def panel(model, frames: list[tuple[str, dict]], height: int = 180) -> np.ndarra
 
 def finish(model, scene: Scene, cfg: Config, state: dict, energy: dict, run: Path) -> dict:
     """Scores a trained model and writes metrics.json, panel.png and mesh.ply below run."""
-    scores = evaluate(model, scene, cfg, make_lpips(scene.rgb.device))
+    scores = evaluate(model, scene, cfg, make_lpips(scene.c2w.device))
     frames = [(f"held out: {name}", frame) for name, frame in scores.pop("frames")[:3]]
     busy = scene.photos(False)
     if hasattr(model, "logits"):  # training photos with most on the mask
@@ -1809,7 +1834,7 @@ def finish(model, scene: Scene, cfg: Config, state: dict, energy: dict, run: Pat
     write_png(run / "panel.png", panel(model, frames))
     if hasattr(model, "sdf"):
         write_ply(run / "mesh.ply", *extract_mesh(model))
-    octrees, is_gpu = model.octrees(), scene.rgb.is_cuda
+    octrees, is_gpu = model.octrees(), scene.c2w.is_cuda
     cpu = f"cpu, {torch.get_num_threads()} threads"
     structure = sum(o.bytes() - 4 * o.features.numel() for o in octrees)
     git = ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short", "HEAD"]
@@ -2299,6 +2324,8 @@ def run_command_line(entry) -> None:
         return entry()
     except UserError as error:
         message = str(error)
+    except torch.OutOfMemoryError:
+        message = "the GPU's memory is full: lower --rays, --samples or --max_mb"
     except OSError as error:  # a full disk, a folder without permission
         message = f"{error}: free or choose a place, then go on with --resume"
     except KeyboardInterrupt:  # outside the training loop, which ends its step and saves
