@@ -2298,7 +2298,8 @@ def main(argv: list[str] | None = None) -> None:
         chart("chart", {name: [m for m, n in zip(runs, names) if n == name]
                         for name in RIVALS if name in names})
     elif "chart" in commands:
-        chart("chart", matrix(f"chart-{scene_name(cfg)}", RIVALS, timed, seeds))
+        rows = {k: row for k, row in RIVALS.items() if row.get("tuned", cfg.tuned) == cfg.tuned}
+        chart("chart", matrix(f"chart-{scene_name(cfg)}", rows, timed, seeds))
     elif "front" in commands:
         chart("front", matrix(f"front-{scene_name(cfg)}", FRONT, timed, seeds, workers))
     elif "ablation" in commands:

@@ -1089,7 +1089,7 @@ def random(*shape, seed=0, low=0.0, high=1.0, dtype=torch.float64):
 
 
 def close(a, b, rtol=1e-5, atol=1e-6):
-    a, b = (torch.as_tensor(v).double() for v in (a, b))
+    a, b = (torch.as_tensor(v).detach().double() for v in (a, b))
     torch.testing.assert_close(a, b, rtol=rtol, atol=atol)
 
 
@@ -4182,6 +4182,19 @@ def test_chart_without_matplotlib_says_what_to_install(monkeypatch):
 def test_a_finished_run_of_a_matrix_is_read_and_not_repeated(tmp_path):
     run = Path(finished(tmp_path / "a", method="geonvsw", psnr=12.5))
     assert g.run_once(dict(steps=1), run)["psnr"] == 12.5
+
+
+@pytest.mark.parametrize("flag, rivals", [([], ["nerfw", "hanerf"]), (["--tuned"], ["nerfw tuned", "hanerf tuned"])])
+def test_a_chart_trains_all_methods_for_the_same_time(tmp_path, monkeypatch, flag, rivals):
+    monkeypatch.chdir(tmp_path)
+    trained, drawn = {}, {}
+    monkeypatch.setattr(g, "matrix", lambda kind, rows, given, seeds: trained.update(
+        {name: g.make_config(given | row) for name, row in rows.items()}))
+    monkeypatch.setattr(g, "chart", lambda kind, groups: drawn.update(kind=kind))
+    g.main(["--chart", *flag, "--minutes", "3"])
+    assert list(trained) == ["geonvsw", *rivals] and drawn == dict(kind="chart")
+    assert {(cfg.minutes, cfg.curve) for cfg in trained.values()} == {(3.0, True)}
+    assert all(cfg.tuned == (flag != []) for name, cfg in trained.items() if name != "geonvsw")
 
 
 def test_a_run_of_other_settings_is_not_taken_for_this_one(tmp_path, monkeypatch):
