@@ -928,15 +928,15 @@ class GeoNVS(Method):
     @torch.no_grad()
     def refine(self, optimizer: torch.optim.Optimizer) -> None:
         """Fits the octree to the scene: no fine cell far from the surface or where pictures agree.
-        Cells of a level >= 1 are newly split at the surface where that pays, coarse levels first,
-        up to cfg.max_mb. A cell is merged again when nothing of it, nor within a child's side of
+        Cells are newly split at the surface where that pays, coarse levels first, as far as
+        cfg.max_mb allows. A cell is merged again when nothing of it, nor within a child's side of
         it, where corners become pinned, is nearer to the surface than HIDDEN / zeta: if |grad s| is
         1, no pixel changes by more than 2 sigmoid(-HIDDEN) = 0.005. Adam's moments move along."""
         octree, keys, zeta = self.sdf.octree, list(self.sdf.octree.split_keys), self.deviation()
         hits = self.hits[self.hits[:, 0] < 2]  # (P,5) without the slots that no ray has filled
         split_bytes = 8 * (36 + 4 * octree.features.shape[1])  # nodes, and as many corners
         room = int(max(0, self.cfg.max_mb * 2 ** 20 - octree.bytes()) // split_bytes)
-        for level in range(1, octree.levels - 1):
+        for level in range(octree.levels - 1):
             if not len(octree.cells[level]):
                 break
             s = torch.cat([self.sdf(x)[0] for x in octree.centres(level).split(CHUNK)])  # (N,)

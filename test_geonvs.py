@@ -2810,12 +2810,12 @@ def test_refining_prunes_cells_far_from_what_is_seen_and_only_those(zeta):
     octree = model.sdf.octree
     before = octree.split_keys[0].clone(), octree.split_keys[1].clone()
     g.GeoNVS.refine(model, model.optimizer)
-    reach = (math.sqrt(3) / 2 + 1) * octree.cell(1) + g.HIDDEN / zeta
-    assert torch.equal(octree.split_keys[0], before[0])  # the coarsest level stays
-    gone = before[1][~torch.isin(before[1], octree.split_keys[1])]
-    assert len(gone) > 0 < len(octree.split_keys[1])
-    assert (distance_to_cells(octree, 1, octree.split_keys[1]) < reach).all()
-    assert (distance_to_cells(octree, 1, gone) >= reach).all()
+    for level in (0, 1):
+        reach = (math.sqrt(3) / 2 + 1) * octree.cell(level) + g.HIDDEN / zeta
+        gone = before[level][~torch.isin(before[level], octree.split_keys[level])]
+        assert len(gone) > 0 < len(octree.split_keys[level])
+        assert (distance_to_cells(octree, level, octree.split_keys[level]) < reach).all()
+        assert (distance_to_cells(octree, level, gone) >= reach).all()
     assert len(octree.cells[3]) == 0  # nothing was hit, nothing is finer
 
 
@@ -2841,7 +2841,7 @@ def test_what_lies_deeper_than_hidden_changes_a_pixel_by_half_a_percent_at_most(
 
 
 def test_refining_splits_where_rays_miss_their_colour_and_nowhere_else():
-    for error, want in ((0.12, True), (0.08, False)):  # the median is 0.1
+    for error, want in ((0.22, True), (0.18, False)):  # the lower quartile is 0.1
         model = refinable()
         at = hit_the_ball(model, 5, error)
         g.GeoNVS.refine(model, model.optimizer)
