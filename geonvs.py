@@ -136,9 +136,9 @@ class Config:
 LARGE = dict(steps=300_000, rays=4096, photos=16, samples=32, bg_samples=16, appearance_dim=32)
 # settings that differ from Config's defaults, by scene; flags override them
 SCENES = {"toy": dict(steps=3000), **{name: LARGE for name in data_prep.SCENES}}
-# factors on the scene's settings, from the front that --front measures
-PRESETS = {"fast": dict(steps=0.5, samples=0.5, bg_samples=0.5), "default": {},
-           "best": dict(steps=2, rays=2, samples=1.5, bg_samples=1.5)}
+# factors on Geo-NVS-w's settings, from the front that --front measures: within a minute, half the
+# rays twice as often win over more samples or rays; beyond it, steps are what is left to buy
+PRESETS = {"fast": dict(rays=0.5, steps=0.5), "default": {}, "best": dict(steps=3)}
 
 
 # ---- 2 Scene file and rays -----------------------------------------------------------------------
@@ -1476,11 +1476,7 @@ def train(cfg: Config, scene: Scene, run: Path, saved: dict | None = None):
             if RANK == 0 and (time.perf_counter() > last_line + 5 or state["step"] == cfg.steps):
                 last_line = time.perf_counter()
                 logs = model.health() | logs
-                report_line(cfg, log_path, state["step"], clock(), progress, logs, int(dropped))
-                for name, (low, high, meaning) in HEALTH.items() if progress > 1 / 3 else ():
-                    if name in logs and name not in warned and not low <= logs[name] <= high:
-                        warned.add(name)
-                        print(f"  warning: {name} is {logs[name]:.3g}: {meaning}")
+                report(cfg, log_path, state["step"], clock(), progress, logs, int(dropped), warned)
             if seconds - last_save > CHECKPOINT_S:
                 save()
                 last_save = seconds
@@ -1498,8 +1494,8 @@ def train(cfg: Config, scene: Scene, run: Path, saved: dict | None = None):
     return model, state, meter
 
 
-def report_line(cfg, log_path, step, seconds, progress, logs, dropped) -> None:
-    """One line on the terminal and one in log.jsonl."""
+def report(cfg, log_path, step, seconds, progress, logs, dropped, warned: set) -> None:
+    """A line on the terminal and one in log.jsonl; a warning, once, where a figure is unhealthy."""
     values = {k: float(v) for k, v in logs.items()}
     values["psnr"] = -10 * math.log10(max(values.pop("mse"), 1e-10))
     rate, left = step * cfg.rays / seconds, seconds / max(progress, 1e-3) * (1 - progress)
@@ -1507,6 +1503,10 @@ def report_line(cfg, log_path, step, seconds, progress, logs, dropped) -> None:
           f" mask {values['mask']:.3f}  {rate:8.0f} rays/s  {left / 60:5.1f} min left", flush=True)
     with open(log_path, "a") as file:
         file.write(json.dumps(dict(step=step, seconds=seconds, dropped=dropped) | values) + "\n")
+    for name, (low, high, meaning) in HEALTH.items() if progress > 1 / 3 else ():
+        if name in values and name not in warned and not low <= values[name] <= high:
+            warned.add(name)
+            print(f"  warning: {name} is {values[name]:.3g}: {meaning}")
 
 
 # ---- 11 Scoring, mesh, pictures ------------------------------------------------------------------
@@ -2054,6 +2054,10 @@ def plot_curves(axis, groups: dict[str, list[dict]], unit: str, xlabel: str) -> 
         floor, _ = summary([m for metrics in groups.values() for m in metrics], "psnr_floor")
         axis.axhline(floor, color="grey", lw=1, label="trivial predictor")
         axis.set_xscale("log")
+        ticks = [m * 10.0 ** k for k in range(-4, 7) for m in (1, 2, 5)]
+        ticks = [t for t in ticks if axis.get_xlim()[0] < t < axis.get_xlim()[1]]
+        axis.set_xticks(ticks, [f"{t:g}" for t in ticks])
+        axis.minorticks_off()
         axis.legend(fontsize=8)
     else:
         axis.text(0.5, 0.5, f"no {unit} in these runs\n(--curve records, energy needs a counter)",
@@ -2270,9 +2274,10 @@ def render_film(kind: str, run: Path, given: dict) -> None:
 def make_config(given: dict) -> Config:
     """Config's defaults, the scene's settings, the method's, the preset's factors, then flags."""
     chosen = {} if given.get("data") else dict(SCENES.get(given.get("scene", "toy"), {}))
-    _, published, tuned = METHODS[given.get("method", "geonvsw")]
+    method, preset = given.get("method", "geonvsw"), given.get("preset", "default")
+    _, published, tuned = METHODS[method]
     chosen |= published | (tuned if given.get("tuned") else {})
-    for name, factor in PRESETS[given.get("preset", "default")].items():
+    for name, factor in PRESETS[preset].items() if method == "geonvsw" else ():
         chosen[name] = round(chosen.get(name, getattr(Config, name)) * factor)
     return Config(**chosen | given)
 

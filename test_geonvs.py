@@ -4120,11 +4120,14 @@ def test_the_pareto_front_is_what_nothing_beats_at_the_same_cost():
 
 def test_presets_are_factors_and_flags_override_them():
     base, fast, best = (g.make_config(dict(preset=name)) for name in ("default", "fast", "best"))
-    assert fast.samples < base.samples < best.samples and fast.steps < base.steps < best.steps
-    assert base.samples == g.make_config({}).samples
-    assert g.make_config(dict(preset="fast", samples=12)).samples == 12
-    sacre = g.make_config(dict(preset="best", scene="sacre"))
-    assert sacre.samples == round(g.LARGE["samples"] * g.PRESETS["best"]["samples"])
+    assert fast.rays < base.rays == best.rays and fast.steps < base.steps < best.steps
+    assert base == g.make_config({}) != fast
+    assert g.make_config(dict(preset="fast", steps=12)).steps == 12
+    sacre, nerfw = (g.make_config(dict(preset="fast") | more) for more in (dict(scene="sacre"), dict(method="nerfw")))
+    assert sacre.rays == round(g.LARGE["rays"] * g.PRESETS["fast"]["rays"])
+    assert nerfw.rays == g.METHODS["nerfw"][1]["rays"]  # baselines keep their own
+    for preset in g.PRESETS:
+        g.check(g.make_config(dict(preset=preset)))
 
 
 def test_tuned_baselines_replace_published_settings():
