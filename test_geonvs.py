@@ -2908,6 +2908,22 @@ def test_refining_stays_within_its_memory_and_takes_the_worst_first():
     assert (octree.cells[3] // 2 == octree.cell_of(worst, 2)).all()
 
 
+def test_refining_shares_its_memory_among_the_levels():
+    model = refinable()
+    g.GeoNVS.refine(model, model.optimizer)
+    octree, home = model.sdf.octree, hit_the_ball(model, 10, 0.9)
+    octree.prune(1, octree.cell_of(home, 1))  # one cell of level 1 and one of level 2 are worth it
+    model.optimizer = torch.optim.Adam([octree.features])
+    octree.features[1:].sum().backward()
+    model.optimizer.step()
+    model.hits[10:20] = model.hits[:10]
+    hit_the_ball(model, 10, 0.9, (-1.0, 0.2, 0.1))
+    n = sum(map(len, octree.cells))
+    model.cfg = config(max_mb=(octree.bytes() + 8 * (36 + 4 * 2) + 0.5) / 2 ** 20)
+    g.GeoNVS.refine(model, model.optimizer)
+    assert sum(map(len, octree.cells)) == n + 8  # room for one of them
+
+
 def test_adams_moments_move_with_their_features():
     model = refinable()
     octree, rate = model.sdf.octree, model.optimizer.state[model.sdf.octree.features]["step"].item()
@@ -3318,6 +3334,17 @@ def test_full_gpu_memory_is_one_sentence(capsys):
     with pytest.raises(SystemExit) as end:
         g.run_command_line(fill)
     assert end.value.code == 2 and "--rays" in capsys.readouterr().err
+
+
+def test_void_steps_between_good_ones_do_not_stop_a_run(scene, tmp_path, brief, monkeypatch):
+    losses = g.GeoNVS.losses
+
+    def poison(self, *args):
+        total, logs = losses(self, *args)
+        return (total if self.step % 5 == 0 else total * math.nan), logs
+    monkeypatch.setattr(g.GeoNVS, "losses", poison)
+    state = run_training(scene, tmp_path, steps=2 * g.PATIENCE)[1]
+    assert state["step"] == 2 * g.PATIENCE and state["dropped"] == 8 * g.PATIENCE // 5
 
 
 def test_a_diverged_run_of_a_matrix_is_a_result(arrays, tmp_path, brief, monkeypatch):
