@@ -41,7 +41,9 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import csv
 import difflib
+import functools
 import itertools
 import json
 import math
@@ -241,6 +243,12 @@ def sphere_interval(rays: Rays) -> tuple[Tensor, Tensor, Tensor]:
 CORNERS = torch.cartesian_prod(*[torch.arange(2)] * 3)  # (8,3), x slowest
 
 
+@functools.cache
+def resident(constant: Tensor, device: torch.device) -> Tensor:
+    """A constant on a device, copied once: a copy in every step would make a GPU wait."""
+    return constant.to(device)
+
+
 def trilinear_matrices() -> Tensor:
     """(8,32): the monomials 1 z y yz x xz xy xyz of a position in a cell times this are the weights
     of the 8 corners, then their derivatives along x, y, z. Per axis the ends weigh 1 - f and f."""
@@ -383,7 +391,7 @@ class Octree(nn.Module):
         yz = fy * fz
         basis = torch.stack([torch.ones_like(fx), fz, fy, yz, fx, fx * fz, fx * fy, fx * yz], 1)
         with torch.autocast(x.device.type, enabled=False):  # [D9] corners have float32 features
-            w = basis @ TRILINEAR[:, :8 * J].to(x.device)  # (PL,8) to (PL,8J)
+            w = basis @ resident(TRILINEAR, x.device)[:, :8 * J]  # (PL,8) to (PL,8J)
         out = Interpolate.apply(self.features, corner.reshape(-1, 8), w.reshape(-1, J, 8))
         return out.reshape(P, L, J, self.features.shape[1])
 
@@ -447,14 +455,14 @@ class SDFField(nn.Module):
         return out[:, 0], out[:, 1:], grad
 
 
-TETRAHEDRON = torch.tensor([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])  # (4,3) directions
+TETRAHEDRON = F.normalize(torch.tensor([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]))  # (4,3)
 
 
 def finite_differences(sdf, x: Tensor, eps: float, centre: Tensor | None = None):
     """Gradient (P,3) and Laplacian (P,) of sdf at x (P,3) from 4 tetrahedral taps (Neuralangelo).
-    Taps sit at x + eps k / sqrt(3): their mean difference to the centre is eps^2/6 times the
+    Taps sit at x + eps k, |k| = 1: their mean difference to the centre is eps^2/6 times the
     Laplacian, their k-weighted mean the gradient. centre: s(x) where the caller has it already."""
-    k = TETRAHEDRON.to(x) / math.sqrt(3)  # (4,3)
+    k = resident(TETRAHEDRON, x.device).to(x.dtype)  # (4,3)
     taps = sdf((x[:, None] + eps * k).reshape(-1, 3)).reshape(-1, 4)  # (P,4)
     centre = sdf(x) if centre is None else centre  # (P,)
     slope = (taps[:, :, None] * k).sum(1)  # (P,3) not taps @ k: autocast would round the taps [D9]
@@ -697,9 +705,13 @@ def edge_indicator(e_grad: Tensor, e_curv: Tensor, lam_grad: float, lam_lap: flo
     return torch.sigmoid(x if calibration is None else (x - calibration[0]) / calibration[1])
 
 
+QUANTILES = torch.tensor([0.5, 0.75, 0.95])
+
+
 def calibrate(x: Tensor, calibration: Tensor, rate: float = 0.05) -> None:
     """Moves calibration (2,) to the batch's: 75th percentile and width (p95 - p50) / 4. [D3]"""
-    p50, p75, p95 = torch.quantile(x.detach().nan_to_num(0, 0, 0), x.new_tensor([0.5, 0.75, 0.95]))
+    x = x.detach().nan_to_num(0, 0, 0)  # (R,)
+    p50, p75, p95 = torch.quantile(x, resident(QUANTILES, x.device))
     calibration.lerp_(torch.stack([p75, ((p95 - p50) / 4).clamp(min=1e-3)]), rate)
 
 
@@ -1924,7 +1936,7 @@ PIECES = {  # of the method, one changed at a time
 RIVALS = {"geonvsw": {}} | {
     f"{method}{how}": dict(method=method, tuned=bool(how))
     for method in ("nerfw", "hanerf") for how in ("", " tuned")}
-FRONT = {f"{rays} rays, {n} samples": dict(rays=rays, samples=n, bg_samples=n)
+FRONT = {f"{rays} rays x {n} samples": dict(rays=rays, samples=n, bg_samples=n)
          for rays in (256, 512, 1024) for n in (8, 16, 24)}
 CALM = dict(occluders=0.2, exposure=1.0, photos=24, pose_noise=0.0, amp="off")  # of a 64 px toy,
 STRESS = {  # and one knob turned at a time
@@ -2001,9 +2013,13 @@ def table_line(name: dict, metrics: list[dict]) -> dict:
 def write_table(path: Path, rows: list[dict]) -> None:
     """CSV of rows with the same keys; None stays empty."""
     def cell(v):
-        return "" if v is None else f"{v:.5g}" if isinstance(v, float) else str(v)
-    lines = [list(rows[0])] + [[cell(v) for v in row.values()] for row in rows]
-    write_text(path, "".join(",".join(line) + "\n" for line in lines))
+        return f"{v:.5g}" if isinstance(v, float) else v
+
+    def write(tmp):
+        with open(tmp, "w", newline="") as file:
+            lines = [list(rows[0])] + [[cell(v) for v in row.values()] for row in rows]
+            csv.writer(file, lineterminator="\n").writerows(lines)
+    atomic_write(path, write)
     print(f"wrote {path}")
 
 

@@ -36,6 +36,7 @@ import torch
 import torch.nn.functional as F
 from hypothesis import HealthCheck, given, settings, strategies as st
 from torch import nn
+from torch.utils._python_dispatch import TorchDispatchMode
 
 import data_prep
 import geonvs as g
@@ -2374,6 +2375,58 @@ def test_every_loss_and_gradient_is_finite(warm, scene, changes):
     total.backward()
     assert all(math.isfinite(float(v)) for v in (total.detach(), *logs.values()))
     assert all(torch.isfinite(p.grad).all() for p in model.parameters() if p.grad is not None)
+
+
+class Operations(TorchDispatchMode):
+    """Names of all operations that run inside, and of those that copy from one device to another."""
+    def __init__(self):
+        super().__init__()
+        self.names, self.copies = [], []
+
+    def __torch_dispatch__(self, operation, types, args=(), kwargs=None):
+        name, kwargs = operation.overloadpacket.__name__, kwargs or {}
+        self.names.append(name)
+        if name == "_to_copy" and kwargs.get("device", args[0].device) != args[0].device:
+            self.copies.append(args)
+        return operation(*args, **kwargs)
+
+
+WAITS = {"_local_scalar_dense", "nonzero", "masked_select", "is_nonzero", "equal", "_unique2", "unique_dim"}
+
+
+def test_a_step_never_asks_a_gpu_for_a_value(scene, brief):
+    """What would make the host wait, on any device: item(), nonzero() and their kin."""
+    model = g.GeoNVS(config(), scene)
+    model.step, model.refined = 4, 5  # a step with the mask network and without refinement
+    optimizer, photos = g.make_optimizer(model), scene.photos(False)
+    with Operations() as seen:
+        g.training_step(model, optimizer, photos, dict(step=5), 0.5, generator())
+        assert len(seen.names) > 500 and not WAITS & set(seen.names)
+        model.calibration[0].item()
+    assert WAITS & set(seen.names)
+
+
+@pytest.mark.parametrize("changes", [dict(), dict(normals="fd")])
+def test_a_step_copies_nothing_between_devices(scene, monkeypatch, changes):
+    """The meta device computes shapes alone; whatever still lies on the CPU has to be copied to it."""
+    model, meta = g.GeoNVS(config(**changes), scene).to("meta"), torch.device("meta")
+    model.scene = scene._replace(**{k: v.to(meta) for k, v in scene._asdict().items() if torch.is_tensor(v)})
+    model.step, model.sfm = 4, model.sfm.to(meta)
+    for octree in model.octrees():
+        octree.child, octree.corner = octree.child.to(meta), octree.corner.to(meta)
+    for draw in ("rand", "randn", "randint"):  # a generator cannot live there
+        monkeypatch.setattr(torch, draw, lambda *a, generator, _draw=getattr(torch, draw), **k: _draw(*a, **k))
+    monkeypatch.setattr(torch, "autocast", lambda *a, **k: contextlib.nullcontext())
+
+    def step():
+        rays, pick = model.batch(torch.arange(6, device=meta), SimpleNamespace(device=meta))
+        model.losses(rays, pick, 0.5, SimpleNamespace(device=meta))[0].backward()
+    step()  # constants become resident
+    with Operations() as seen:
+        step()
+        assert len(seen.names) > 500 and not seen.copies
+        g.TRILINEAR.to(meta)
+    assert len(seen.copies) == 1
 
 
 @pytest.mark.parametrize("normals", ["analytic", "fd"])
