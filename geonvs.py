@@ -89,7 +89,7 @@ class Config:
     data: str = opt("", "an IMC-PT or COLMAP folder instead of a named scene")
     method: str = opt("geonvsw", "which model to train", "geonvsw", "nerfw", "hanerf")
     preset: str = opt("default", "quality against speed: see PRESETS", "fast", "default", "best")
-    tuned: bool = opt(False, "a baseline's settings that serve the toy best, not its paper's")
+    tuned: bool = opt(False, "the method's settings that serve the toy best in a few minutes")
     name: str = opt("", "run folder below runs/ (default: scene-method-seed)")
     seed: int = opt(0, "seed of everything random")
     device: str = opt("auto", "auto, cpu, cuda or cuda:N")
@@ -130,6 +130,7 @@ class Config:
     lr_grid: float = opt(1e-2, "learning rate of octree features")
     lr_net: float = opt(2e-3, "learning rate of networks and codes")
     lr_zeta: float = opt(1e-3, "learning rate of the deviation network")
+    lr_mask: float = opt(8e-3, "learning rate of the mask network, which learns in few steps [D14]")
     curve: bool = opt(False, "record PSNR of held-out left halves over s and Wh, for --chart")
     amp: str = opt("auto", "mixed precision; auto: on a GPU [D9]", "auto", "on", "off")
     protocol: str = opt("half", "half: fit left, score right [D12]; leaky: all", "half", "leaky")
@@ -455,7 +456,7 @@ class SDFField(nn.Module):
         return out[:, 0], out[:, 1:], grad
 
 
-TETRAHEDRON = F.normalize(torch.tensor([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]))  # (4,3)
+TETRAHEDRON = torch.tensor([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / math.sqrt(3)
 
 
 def finite_differences(sdf, x: Tensor, eps: float, centre: Tensor | None = None):
@@ -741,6 +742,9 @@ def random_ball(n: int, gen: torch.Generator) -> Tensor:
 
 class Method(nn.Module):
     """What the training loop asks of a method, with the answers that most of them give."""
+
+    step = 0  # number of the present step, set by the loop
+
     def octrees(self) -> list[Octree]:
         return []
 
@@ -777,7 +781,7 @@ def worth_splitting(octree: Octree, level: int, hits: Tensor, bound: float) -> T
 
 
 REFINE_AT = (0.1, 0.2, 0.3, 0.45, 0.6)  # shares of training at which the octree is refined
-SPLIT_RAYS = 4  # recent rays that end in a cell before it is split
+SPLIT_RAYS = 6  # recent rays that end in a cell before it is split
 HIDDEN = 6.0  # zeta |s| from where on the field is not seen: sigmoid(-6) = 0.0025
 MASK_FROM = 0.2  # share of training after which the mask may act: before, every pixel is wrong
 
@@ -786,7 +790,7 @@ class GeoNVS(Method):
     """The paper's model: what it learns, and what it caches to be fast."""
     def __init__(self, cfg: Config, scene: Scene, gen: torch.Generator | None = None):
         super().__init__()
-        self.cfg, self.scene, self.step, self.refined = cfg, scene, 0, 0
+        self.cfg, self.scene, self.refined = cfg, scene, 0
         self.use_mask, dev = cfg.mask != "off", scene.c2w.device
         inside = scene.points.norm(dim=1) < 1
         self.sfm = scene.points[inside]  # (K,3)
@@ -822,20 +826,23 @@ class GeoNVS(Method):
         self.to(dev)
 
     def get_extra_state(self) -> dict:
-        return dict(step=self.step, refined=self.refined, use_mask=self.use_mask)
+        return dict(refined=self.refined, use_mask=self.use_mask)
 
     def set_extra_state(self, state: dict) -> None:
-        self.step, self.refined, self.use_mask = state["step"], state["refined"], state["use_mask"]
+        self.refined, self.use_mask = state["refined"], state["use_mask"]
 
     def octrees(self) -> list[Octree]:
         return [part.octree for part in (self.sdf, self.background) if part is not None]
 
     def groups(self) -> list[dict]:
-        """Optimiser groups: features fast, networks and codes slower, zeta on its own."""
-        grids, zeta = [o.features for o in self.octrees()], self.deviation.v
-        nets = [p for p in self.parameters() if all(p is not q for q in (*grids, zeta))]
-        return [dict(params=grids, lr=self.cfg.lr_grid), dict(params=nets, lr=self.cfg.lr_net),
-                dict(params=[zeta], lr=self.cfg.lr_zeta)]
+        """Optimiser groups: features fast, networks and codes slower, zeta and mask apart."""
+        cfg, grids = self.cfg, [o.features for o in self.octrees()]
+        others = [dict(params=grids, lr=cfg.lr_grid),
+                  dict(params=[self.deviation.v], lr=cfg.lr_zeta),
+                  dict(params=list(self.cgnet.parameters()), lr=cfg.lr_mask)]
+        taken = {id(p) for group in others for p in group["params"]}
+        nets = [p for p in self.parameters() if id(p) not in taken]
+        return [dict(params=nets, lr=cfg.lr_net), *others]
 
     def start(self, gen: torch.Generator, steps: int = 200, radius: float = 0.25) -> None:
         """Warm-up: L_sphere fits the SDF to a sphere. A small one: a surface that starts inside the
@@ -850,7 +857,7 @@ class GeoNVS(Method):
         grid = dict(params=[self.sdf.octree.features], lr=1e-3)
         adam = torch.optim.Adam([grid, dict(params=nets, lr=5e-3)])
         for _ in range(steps):
-            x = random_ball(2048, gen)  # (P,3)
+            x = random_ball(1024, gen)  # (P,3)
             loss = ((self.sdf(x)[0] - (x.norm(dim=1) - radius)) ** 2).mean()
             adam.zero_grad()
             loss.backward()
@@ -913,7 +920,7 @@ class GeoNVS(Method):
         error, edge = self.seen[pick].split(1, 1)  # (B,1,h,w)
         known = (error >= 0).float()  # (B,1,h,w)
         error = blur(error * known) / blur(known).clamp(min=0.1)  # (B,1,h,w)
-        price = cfg.lam_mask + 1.5 * self.level + cfg.lam_gpl * edge - error  # (B,1,h,w) [D7]
+        price = cfg.lam_mask + 2 * self.level + cfg.lam_gpl * edge - error  # (B,1,h,w) [D7]
         slope = F.softplus(torch.where(price > 0, logits, -logits))  # (B,1,h,w)
         pull = cfg.lam_bimodal * bimodality(logits.sigmoid())
         return (price.abs() * slope * known).mean() + pull
@@ -971,7 +978,6 @@ class GeoNVS(Method):
 
     def maintain(self, step: int, progress: float, optimizer: torch.optim.Optimizer) -> None:
         """Cache slices are refreshed; a few times, the model is fitted to the scene."""
-        self.step = step + 1
         if step % 8 == 0:
             self.refresh_cache(step // 8 % 8, 8)
         if self.refined == len(REFINE_AT) or progress < REFINE_AT[self.refined]:
@@ -1164,7 +1170,7 @@ class HaNeRF(NeRFW):
         error, coarse = (((out[k] - rays.rgb) ** 2).mean(1) for k in ("rgb", "coarse"))  # (R,)
         window = out["rgb"].reshape(1, side, side, 3).permute(0, 3, 1, 2)
         again = self.encoder(window * 2 - 1)  # (1,A)
-        price = max(6e-3, 5e-2 * math.exp(-1e-3 * self.cfg.steps * progress))
+        price = max(6e-3, 5e-2 * math.exp(-1e-3 * self.step))
         raw = dict(rgb=((1 - mask) * error).mean() / 2,
                    coarse=((1 - mask.detach()) * coarse).mean() / 2,
                    size=price * (mask ** 2).mean(), code=1e-5 * (code ** 2).mean(),
@@ -1270,11 +1276,11 @@ def make_meter(device: torch.device) -> EnergyMeter:
 # ---- 10 Training ---------------------------------------------------------------------------------
 
 METHODS = {  # the published settings of the baselines, then those that serve the toy best
-    "geonvsw": (GeoNVS, {}, {}),
+    "geonvsw": (GeoNVS, {}, dict(rays=256)),
     "nerfw": (NeRFW, dict(rays=1024, photos=1024, samples=64, hidden=256, lr_net=5e-4),
               dict(rays=256, photos=256, samples=24, hidden=64, lr_net=5e-3)),
     "hanerf": (HaNeRF, dict(rays=1024, photos=1, samples=64, hidden=256, lr_net=5e-4),
-               dict(samples=16, hidden=64, lr_net=4e-3)),
+               dict(rays=256, samples=16, hidden=64, lr_net=4e-3)),
 }
 CHECKPOINT_S = 60.0  # seconds of training between checkpoints
 PATIENCE = 20  # steps in a row without a finite loss and gradient that stop a run
@@ -1399,7 +1405,7 @@ def half_dtype(device: torch.device) -> torch.dtype:
 def training_step(model: Method, optimizer, photos: Tensor, state: dict, progress: float,
                   gen: torch.Generator) -> tuple[dict, Tensor]:
     """One update. Returns the logs, and 1 if a loss or gradient that is not finite made it void."""
-    cfg, device = model.cfg, photos.device
+    cfg, device, model.step = model.cfg, photos.device, state["step"]
     rays, pick = model.batch(photos, gen)
     is_half = cfg.amp == "on" or cfg.amp == "auto" and device.type == "cuda"
     half = half_dtype(device)
@@ -1933,9 +1939,8 @@ PIECES = {  # of the method, one changed at a time
     "finite differences": dict(normals="fd"), "uniform grid": dict(grid="uniform"),
     "half depth": dict(levels=-1), "double depth": dict(levels=1),  # more than the footprint's
 }
-RIVALS = {"geonvsw": {}} | {
-    f"{method}{how}": dict(method=method, tuned=bool(how))
-    for method in ("nerfw", "hanerf") for how in ("", " tuned")}
+RIVALS = {method + how: dict(method=method, tuned=bool(how))
+          for method in ("geonvsw", "nerfw", "hanerf") for how in ("", " tuned")}
 FRONT = {f"{rays} rays x {n} samples": dict(rays=rays, samples=n, bg_samples=n)
          for rays in (256, 512, 1024) for n in (8, 16, 24)}
 CALM = dict(occluders=0.2, exposure=1.0, photos=24, pose_noise=0.0, amp="off")  # of a 64 px toy,
@@ -2249,7 +2254,7 @@ def check(cfg: Config) -> None:
             raise UserError(f"--{name} {value} makes no sense: use a number >= 0")
     least = dict(samples=2, bg_samples=2, rays=2 * RANKS, mask_px=16) | dict.fromkeys(
         ("photos", "steps", "downscale", "channels", "hidden", "mask_every", "bg_levels"), 1)
-    least |= dict(rays=1024) if cfg.method == "hanerf" else {}  # its encoder reads the grid of rays
+    least |= dict(rays=256) if cfg.method == "hanerf" else {}  # its encoder reads the grid of rays
     for name, bound in least.items():
         if getattr(cfg, name) < bound:
             raise UserError(f"--{name} {getattr(cfg, name)} is too small: use at least {bound}")
@@ -2319,7 +2324,7 @@ def main(argv: list[str] | None = None) -> None:
         chart("chart", {name: [m for m, n in zip(runs, names) if n == name]
                         for name in RIVALS if name in names})
     elif "chart" in commands:
-        rows = {k: row for k, row in RIVALS.items() if row.get("tuned", cfg.tuned) == cfg.tuned}
+        rows = {name: row for name, row in RIVALS.items() if row["tuned"] == cfg.tuned}
         chart("chart", matrix(f"chart-{scene_name(cfg)}", rows, timed, seeds))
     elif "front" in commands:
         chart("front", matrix(f"front-{scene_name(cfg)}", FRONT, timed, seeds, workers))
