@@ -1952,7 +1952,7 @@ KNOB_UNITS = dict(occluders="share of occluders", exposure="exposure spread", am
 SMALL = dict(steps=300, rays=256, mask_px=64, bg_samples=8)  # half a minute with scoring
 STRESS_METHODS = {piece: PIECES[piece] | SMALL for piece in
                   ("full", "no GPL", "literal GPL", "no mask", "no appearance")}
-STRESS_METHODS |= {method: RIVALS[f"{method} tuned"] | dict(minutes=0.2, steps=10 ** 6)
+STRESS_METHODS |= {method: RIVALS[f"{method} tuned"] | dict(minutes=0.5, steps=10 ** 6)
                    for method in ("nerfw", "hanerf")}
 COLORS = "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#999999"
 FIGURES = ("psnr", "psnr_floor", "ssim", "sdf_error", "mask_iou", "mask_static", "octree_bytes",
@@ -2079,9 +2079,9 @@ def plot_curves(axis, groups: dict[str, list[dict]], unit: str, xlabel: str) -> 
         ticks = [t for t in ticks if axis.get_xlim()[0] < t < axis.get_xlim()[1]]
         axis.set_xticks(ticks, [f"{t:g}" for t in ticks])
         axis.minorticks_off()
-        axis.legend(fontsize=8)
+        axis.legend(fontsize=8, ncol=3, loc="upper left", bbox_to_anchor=(0, -0.13))
     else:
-        axis.text(0.5, 0.5, f"no {unit} in these runs\n(--curve records, energy needs a counter)",
+        axis.text(0.5, 0.5, f"no {unit} in these runs\n(needs --curve\nand a counter)",
                   ha="center", va="center", transform=axis.transAxes)
     axis.set(xlabel=xlabel, ylabel="PSNR on held-out left halves, dB")
     axis.grid(alpha=0.3)
@@ -2107,7 +2107,9 @@ def chart(kind: str, groups: dict[str, list[dict]]) -> None:
                 theirs = spent[unit, goal]
                 row[f"{unit}_ratio_{goal}"] = mean / theirs if mean and theirs else None
         rows.append(row)
-    figure, axes = plt.subplots(1, 2, figsize=(12, 4.5), sharey=True)
+    has_energy = any(p["wh"] for metrics in groups.values() for m in metrics for p in m["curve"])
+    figure, axes = plt.subplots(1, 2, figsize=(12, 4.5), sharey=True,
+                                width_ratios=(1, 1 if has_energy else 0.3))
     plot_curves(axes[0], groups, "seconds", "training time, s")
     plot_curves(axes[1], groups, "wh", "energy, Wh")
     some = next(m for metrics in groups.values() for m in metrics if "failed" not in m)
