@@ -1385,6 +1385,10 @@ def restore(saved: dict, path: Path, model, optimizer, gen: torch.Generator) -> 
             for group, new in zip(optimizer.param_groups, model.groups(), strict=True):
                 group["params"] = new["params"]
             optimizer.load_state_dict(saved["optimizer"])
+            for p, moments in optimizer.state.items():
+                shapes = dict(step=torch.Size(), exp_avg=p.shape, exp_avg_sq=p.shape)
+                if {k: v.shape for k, v in moments.items()} != shapes:
+                    raise ValueError("Adam's moments have other shapes")
             gen.set_state(saved["rng"].cpu())
         return saved["state"]
     except (KeyError, IndexError, ValueError, RuntimeError, TypeError, AttributeError) as error:

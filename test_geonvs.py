@@ -3717,6 +3717,16 @@ def test_checkpoints_with_a_wrong_value_are_refused(six, restored, place, odd):
     assert not restored(torch_bytes(odd))
 
 
+@pytest.mark.parametrize("moment", [torch.zeros(3), torch.zeros(0), 1.0, None])
+def test_checkpoints_with_wrong_moments_are_refused(six, restored, moment):
+    saved = copy.deepcopy(six.saved)
+    assert restored(torch_bytes(saved))
+    saved["optimizer"]["state"][1] |= dict(exp_avg=moment)
+    if moment is None:
+        del saved["optimizer"]["state"][1]["exp_avg"]
+    assert not restored(torch_bytes(saved))
+
+
 def test_a_checkpoint_larger_inside_than_outside_is_refused_unread(
         six, restored, tmp_path, monkeypatch):
     loads, load = [], torch.load
