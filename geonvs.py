@@ -7,7 +7,7 @@ the sections follow one ray from the pixel to the loss, then the training loop a
     python geonvs.py                       toy scene: made, trained, scored (minutes, 2 CPU cores)
     python geonvs.py --scene brandenburg   a Phototourism scene (one GPU); also sacre, trevi, taj
     python geonvs.py --data DIR            your own COLMAP folder
-    torchrun --nproc_per_node 4 geonvs.py  the same on 4 GPUs, that share the rays of each step
+    torchrun --nproc_per_node 4 geonvs.py  on 4 GPUs that share the rays of each step
     python geonvs.py --help                every setting with its meaning, unit and source
 
 A run writes runs/<name>/: metrics.json, log.jsonl, checkpoint.pt, panel.png, mesh.ply.
@@ -48,7 +48,7 @@ import itertools
 import json
 import math
 import os
-import platform
+import shutil
 import signal
 import subprocess
 import sys
@@ -85,7 +85,7 @@ def opt(default, text, *choices):
 class Config:
     """All settings. [R] marks a value that the paper leaves open (recommended by predecessors)."""
 
-    scene: str = opt("toy", "toy, brandenburg, sacre, trevi or taj")
+    scene: str = opt("toy", "synthetic, or of Phototourism", "toy", *data_prep.SCENES)
     data: str = opt("", "an IMC-PT or COLMAP folder instead of a named scene")
     method: str = opt("geonvsw", "which model to train", "geonvsw", "nerfw", "hanerf")
     preset: str = opt("default", "quality against speed: see PRESETS", "fast", "default", "best")
@@ -133,14 +133,14 @@ class Config:
     lr_mask: float = opt(8e-3, "learning rate of the mask network, which learns in few steps [D14]")
     curve: bool = opt(False, "record PSNR of held-out left halves over s and Wh, for --chart")
     amp: str = opt("auto", "mixed precision; auto: on a GPU [D9]", "auto", "on", "off")
-    protocol: str = opt("half", "half: fit left, score right [D12]; leaky: all", "half", "leaky")
+    protocol: str = opt("half", "leaky: codes fitted on whole photos [D12]", "half", "leaky")
 
 
 LARGE = dict(steps=300_000, rays=4096, photos=16, samples=32, bg_samples=16, appearance_dim=32)
 # settings that differ from Config's defaults, by scene; flags override them
 SCENES = {"toy": dict(steps=3000), **{name: LARGE for name in data_prep.SCENES}}
-# factors on Geo-NVS-w's settings, from the front that --front measures: within a minute, half the
-# rays twice as often win over more samples or rays; beyond it, steps are what is left to buy
+# factors on Geo-NVS-w's settings, from the front that --front measures: within a minute, steps of
+# half the rays win over those of more rays or samples; beyond it, steps are what is left to buy
 PRESETS = {"fast": dict(rays=0.5, steps=0.5), "default": {}, "best": dict(steps=3)}
 
 
@@ -174,7 +174,7 @@ def load_scene(source: dict | Path, device="cpu", mask_px: int = 96) -> Scene:
               for a, b, (w, h) in zip(raw["start"], raw["start"][1:], raw["wh"])]
     thumbs = [cv2.resize(p, (mask_px, mask_px), interpolation=cv2.INTER_AREA) for p in photos]
     thumbs = torch.as_tensor(np.stack(thumbs)).permute(0, 3, 1, 2).contiguous().to(device)
-    kinds = dict(rgb=torch.uint8, start=torch.long, wh=torch.long, is_test=torch.bool)
+    kinds = dict(start=torch.long, wh=torch.long, is_test=torch.bool)
     arrays = {k: torch.as_tensor(raw[k]).to(device, kinds.get(k, torch.float32))
               for k in Scene._fields[1:8]}
     fits = thumbs.device.type == "cpu" or raw["rgb"].nbytes < torch.cuda.mem_get_info(device)[0] / 2
@@ -183,7 +183,7 @@ def load_scene(source: dict | Path, device="cpu", mask_px: int = 96) -> Scene:
     return Scene(**arrays, thumbs=thumbs, raw=raw, info=json.loads(str(raw["info"])))
 
 
-CHUNK = 4096  # rays or points evaluated at once outside training, on a CPU
+CHUNK = 4096  # rays or points evaluated at once outside training; more rays on a GPU
 
 
 class Rays(NamedTuple):
@@ -580,7 +580,7 @@ PROBES = 64  # cheap lookups of the cached SDF per ray
 FLOOR = 0.2  # share of samples spread uniformly, so that a lost surface can return
 
 
-def cached_weight(cache: Tensor, rays: Rays, edges: Tensor, zeta: float) -> Tensor:
+def cached_weight(cache: Tensor, rays: Rays, edges: Tensor, zeta: Tensor) -> Tensor:
     """NeuS weights (R,N) of sections (R,N+1) from the cached SDF volume (1,1,n,n,n). [D11]"""
     x = rays.at(edges).flip(-1)[None, None]  # (1,1,R,N+1,3) as grid_sample wants it, z first
     s = F.grid_sample(cache, x, padding_mode="border", align_corners=True)[0, 0, 0]  # (R,N+1)
@@ -604,8 +604,9 @@ def sample_sections(model: "GeoNVS", rays: Rays, t0: Tensor, t1: Tensor, n: int,
 
 def render_rays(model: "GeoNVS", rays: Rays, code: Tensor, jitter: Tensor) -> dict[str, Tensor]:
     """One ray batch through the whole model. code: (R,A) appearance; jitter: (R,S+B) in 0..1.
-    Returns rgb (R,3), opacity, depth (R,), normal (R,3), e_grad, e_curv (R,): the NeuS-weighted
-    eikonal error and curvature of Eq. 4 [D3]; hit (R,), the rays' ends x (R,3), eikonal (R,S)."""
+    Returns rgb (R,3), opacity, depth (R,), normal (R,3), e_grad, e_curv (R,): eikonal error and
+    curvature of Eq. 4, NeuS-weighted [D3] (analytic normals: curvature where the ray ends); hit
+    (R,), the rays' ends x (R,3), eikonal error of each sample (R,S)."""
     cfg, R, S = model.cfg, len(rays.o), model.cfg.samples
     t0, t1, hit = sphere_interval(rays)  # (R,)
     with torch.no_grad():
@@ -706,13 +707,10 @@ def edge_indicator(e_grad: Tensor, e_curv: Tensor, lam_grad: float, lam_lap: flo
     return torch.sigmoid(x if calibration is None else (x - calibration[0]) / calibration[1])
 
 
-QUANTILES = torch.tensor([0.5, 0.75, 0.95])
-
-
 def calibrate(x: Tensor, calibration: Tensor, rate: float = 0.05) -> None:
     """Moves calibration (2,) to the batch's: 75th percentile and width (p95 - p50) / 4. [D3]"""
     x = x.detach().nan_to_num(0, 0, 0)  # (R,)
-    p50, p75, p95 = torch.quantile(x, resident(QUANTILES, x.device))
+    p50, p75, p95 = (x.quantile(q) for q in (0.5, 0.75, 0.95))
     calibration.lerp_(torch.stack([p75, ((p95 - p50) / 4).clamp(min=1e-3)]), rate)
 
 
@@ -722,11 +720,6 @@ def gpl_loss(mask: Tensor, edge: Tensor) -> Tensor:
 
 
 # ---- 7 The model and its objective ---------------------------------------------------------------
-
-
-def blur(x: Tensor) -> Tensor:
-    """Mean over 3x3 pixels of (B,1,h,w)."""
-    return F.avg_pool2d(x, 3, 1, 1)
 
 
 def bimodality(mask: Tensor) -> Tensor:
@@ -795,8 +788,11 @@ class GeoNVS(Method):
         inside = scene.points.norm(dim=1) < 1
         self.sfm = scene.points[inside]  # (K,3)
         levels = cfg.levels or levels_for_footprint(float(scene.raw["footprint"]))
-        octree = Octree(1.0, levels, cfg.channels, dev)
         is_octree = len(self.sfm) > 0 and cfg.grid == "octree"
+        if not is_octree:  # a dense cube has 8/7 of its finest cells, as many corners
+            side = (7 / 8 * cfg.max_mb * 2 ** 20 / (36 + 4 * cfg.channels)) ** (1 / 3)  # in cells
+            levels = max(1, min(levels, 1 + int(math.log2(max(side / 16, 1)))))
+        octree = Octree(1.0, levels, cfg.channels, dev)
         dense, radius = (1, 1.0) if is_octree else (levels, math.sqrt(3))
         seed_octree(octree, self.sfm, dense, (0.0, radius))  # [D10]
         self.eps = octree.cell(levels - 1) / 2
@@ -804,7 +800,7 @@ class GeoNVS(Method):
         has_codes = cfg.appearance == "on" or cfg.appearance == "auto" and spread > 0.01
         A = cfg.appearance_dim * has_codes
         self.sdf = SDFField(octree, cfg.hidden)
-        self.appearance = nn.Embedding(len(scene.wh), A)
+        self.appearance = nn.Embedding(len(scene.wh), A).requires_grad_(A > 0)  # at 0 CUDA errs
         nn.init.normal_(self.appearance.weight, std=0.01)
         self.color = LipschitzMLP([GEO + 3 + 9 + A, cfg.hidden, cfg.hidden, 3])
         self.background = None
@@ -813,7 +809,8 @@ class GeoNVS(Method):
             seed_octree(outer, contract(scene.points[~inside]), 1, (1.0, 2.0))
             self.background = Background(outer, cfg.hidden, A)
         self.deviation, self.cgnet = Deviation(), CGNet()
-        I, n, m = len(scene.wh), np.clip(octree.resolution(levels - 1), 64, 128), cfg.mask_px // 2
+        I, m = len(scene.wh), (cfg.mask_px + 1) // 2
+        n = np.clip(octree.resolution(levels - 1), 64, 128)
         memory = dict(
             bg_color=sky.float().nan_to_num(0.5), calibration=torch.tensor([0.0, 1.0]),
             level=torch.tensor(0.1),  # running lower quartile of the L1 error
@@ -865,7 +862,8 @@ class GeoNVS(Method):
         self.refresh_cache(0, 1)
 
     def losses(self, rays: Rays, pick: Tensor, progress: float, gen: torch.Generator):
-        """The objective, Eq. 5: its weighted sum, and by name the raw terms and health signals."""
+        """The objective, Eq. 5: its weighted sum, and by name the raw terms and health signals. The
+        terms that teach M come from mask_objective, every few steps [D14]."""
         cfg, R, K, dev = self.cfg, len(rays.o), len(self.sfm), rays.o.device
         jitter = torch.rand(R, cfg.samples + cfg.bg_samples, generator=gen, device=dev)  # (R,S+B)
         out = in_shares(lambda *v: render_rays(self, *v), rays, self.appearance(rays.img), jitter)
@@ -915,25 +913,22 @@ class GeoNVS(Method):
         sigmoid hardly moves at 0 or 1, price times M is minimised through its logistic surrogate:
         the same sign, so the same optimum, but a slope that never vanishes. Errors are averaged
         over 3x3 pixels first: a person is a blob, a misplaced edge is a line."""
-        cfg, logits = self.cfg, self.mask_logits(pick)  # (B,1,h,w)
+        cfg, logits = self.cfg, self.cgnet(self.scene.thumbs[pick].float() / 255)  # (B,1,h,w)
         self.logits[pick] = logits.detach()
         error, edge = self.seen[pick].split(1, 1)  # (B,1,h,w)
         known = (error >= 0).float()  # (B,1,h,w)
-        error = blur(error * known) / blur(known).clamp(min=0.1)  # (B,1,h,w)
+        total, count = F.avg_pool2d(torch.cat([error * known, known], 1), 3, 1, 1).split(1, 1)
+        error = total / count.clamp(min=0.1)  # (B,1,h,w)
         price = cfg.lam_mask + 2 * self.level + cfg.lam_gpl * edge - error  # (B,1,h,w) [D7]
         slope = F.softplus(torch.where(price > 0, logits, -logits))  # (B,1,h,w)
         pull = cfg.lam_bimodal * bimodality(logits.sigmoid())
         return (price.abs() * slope * known).mean() + pull
 
-    def mask_logits(self, pick: Tensor) -> Tensor:
-        """What the mask network says (B,1,h,w) to photos (B,)."""
-        return self.cgnet(self.scene.thumbs[pick].float() / 255)
-
     def mask_of(self, rays: Rays, pick: Tensor) -> Tensor:
         """M (R,) of rays, R / B from each of photos pick (B,)."""
         if not self.use_mask:
             return torch.zeros_like(rays.near)
-        return mask_at(self.mask_logits(pick), rays.uv)
+        return mask_at(self.cgnet(self.scene.thumbs[pick].float() / 255), rays.uv)
 
     @torch.no_grad()
     def refresh_cache(self, part: int, parts: int) -> None:
@@ -997,12 +992,13 @@ class GeoNVS(Method):
         img, x = (torch.as_tensor(raw[f"track_{k}"]).long().to(dev) for k in ("photo", "point"))
         x = scene.points[x]  # (N,3), seen in photos img (N,)
         pick = torch.nonzero(~scene.is_test[img] & (x.norm(dim=1) < 0.95))[:, 0]
+        if not len(pick):
+            return {}
         pick = pick[::max(1, len(pick) // 256)]  # (R,)
         img, o = img[pick], scene.c2w[img[pick], :, 3]  # (R,), (R,3)
         d = F.normalize(x[pick] - o, dim=1)  # (R,3)
         rays = Rays(o, d, scene.near[img], img, o[:, :2], o)
-        opacity = self.render(rays, self.appearance(img))["opacity"]
-        return dict(sfm_opacity=opacity.mean()) if len(pick) else {}
+        return dict(sfm_opacity=self.render(rays, self.appearance(img))["opacity"].mean())
 
     def render(self, rays: Rays, code: Tensor) -> dict[str, Tensor]:
         """render_rays without jitter, for pictures and for fitting codes."""
@@ -1151,8 +1147,7 @@ class HaNeRF(NeRFW):
     def batch(self, photos: Tensor, gen: torch.Generator) -> tuple[Rays, Tensor]:
         """A square grid of rays over a random window of one photo."""
         pick = photos[torch.randint(len(photos), (1,), generator=gen, device=photos.device)]
-        zoom = torch.rand(1, generator=gen, device=photos.device)
-        size = 0.5 + 0.5 * zoom
+        size = 0.5 + 0.5 * torch.rand(1, generator=gen, device=photos.device)
         corner = torch.rand(2, generator=gen, device=photos.device) * (1 - size)
         grid = torch.linspace(0, 1, math.isqrt(self.cfg.rays), device=photos.device)
         uv = torch.cartesian_prod(grid, grid).flip(1) * size + corner  # (R,2)
@@ -1259,23 +1254,23 @@ def make_meter(device: torch.device) -> EnergyMeter:
         return EnergyMeter("rapl", float) if LOCAL_RANK else rapl_meter()
     try:
         import pynvml
+        pynvml.nvmlInit()
+        uuid = torch.cuda.get_device_properties(device).uuid
+        gpu = pynvml.nvmlDeviceGetHandleByUUID(f"GPU-{uuid}")
+        meter = EnergyMeter("nvml", lambda: pynvml.nvmlDeviceGetTotalEnergyConsumption(gpu) / 1e3,
+                            lambda: pynvml.nvmlDeviceGetPowerUsage(gpu) / 1e3)
+        meter.counter()  # vGPUs and GPUs before Volta have none
+        return meter
     except ImportError:
         print("  no GPU energy: pip install nvidia-ml-py")
-        return EnergyMeter()
-    try:
-        pynvml.nvmlInit()
     except pynvml.NVMLError as error:
         print(f"  no GPU energy: {error}")
-        return EnergyMeter()
-    uuid = torch.cuda.get_device_properties(device).uuid
-    gpu = pynvml.nvmlDeviceGetHandleByUUID(f"GPU-{uuid}")
-    return EnergyMeter("nvml", lambda: pynvml.nvmlDeviceGetTotalEnergyConsumption(gpu) / 1e3,
-                       lambda: pynvml.nvmlDeviceGetPowerUsage(gpu) / 1e3)
+    return EnergyMeter()
 
 
 # ---- 10 Training ---------------------------------------------------------------------------------
 
-METHODS = {  # the published settings of the baselines, then those that serve the toy best
+METHODS = {  # class, settings (the baselines': published), those that serve the toy best
     "geonvsw": (GeoNVS, {}, dict(rays=256)),
     "nerfw": (NeRFW, dict(rays=1024, photos=1024, samples=64, hidden=256, lr_net=5e-4),
               dict(rays=256, photos=256, samples=24, hidden=64, lr_net=5e-3)),
@@ -1446,15 +1441,14 @@ def train(cfg: Config, scene: Scene, run: Path, saved: dict | None = None):
     optimizer, meter = make_optimizer(model), make_meter(device)
     state = dict(step=0, seconds=0.0, joules=None, sampled_joules=None, dropped=0, curve=[])
     checkpoint, log_path = run / "checkpoint.pt", run / "log.jsonl"
-    lines = []
     if saved is not None:
         state |= restore(saved, checkpoint, model, optimizer, gen)
         state |= dict(joules=0.0, sampled_joules=0.0) if RANK else {}  # what all spent counts once
         meter.joules = state["joules"] if meter.counter else None  # all of it was measured, or None
         meter.sampled_joules = state["sampled_joules"] if meter.power else None
-        if log_path.exists():
-            lines = [k for k in log_path.read_text().splitlines(keepends=True) if k.endswith("\n")]
-    write_text(log_path, "".join(k for k in lines if json.loads(k)["step"] <= state["step"]))
+    lines = log_path.read_text().splitlines(True) if saved and log_path.exists() else []
+    write_text(log_path, "".join(k for k in lines if k.endswith("\n")
+                                 and json.loads(k)["step"] <= state["step"]))
     photos, held_out, codes = scene.photos(False), scene.photos(True), None  # (B,)
     dropped = torch.tensor(state["dropped"], device=device)
     streak, warned = torch.zeros_like(dropped), set()  # void steps in a row; warnings given
@@ -1637,16 +1631,14 @@ def validate(model, scene: Scene, photos: Tensor, codes: Tensor | None) -> tuple
     codes = fit_codes(model, scene, photos, codes, 20, "half", 32)
     gen = torch.Generator(scene.c2w.device).manual_seed(1)
     pixel = pixels_of_each([half_pixels(scene, i, True) for i in photos.tolist()], 256, gen)
-    errors = []
-    for img, part, code in zip(photos, pixel.split(256), codes):
-        rays = make_rays(scene, img.expand(256), part)
-        with torch.no_grad():
-            rgb = model.render(rays, code.expand(256, -1))["rgb"]  # (256,3)
-        errors.append(((rgb - rays.rgb) ** 2).mean())
-    return codes, (-10 * torch.log10(torch.stack(errors))).mean().item()
+    rays = make_rays(scene, photos.repeat_interleave(256), pixel)
+    with torch.no_grad():
+        rgb = model.render(rays, codes.repeat_interleave(256, 0))["rgb"]  # (256B,3)
+    errors = ((rgb - rays.rgb) ** 2).reshape(len(photos), -1).mean(1)  # (B,)
+    return codes, (-10 * torch.log10(errors)).mean().item()
 
 
-RAY_BYTES = 2 ** 18  # memory that a ray takes in rendering, generously
+RAY_BYTES = 2 ** 20  # memory that a ray takes in rendering: NeRF-W at full size needs 0.6 MiB
 
 
 @torch.no_grad()
@@ -1655,14 +1647,13 @@ def render_photo(model, scene: Scene, photo: int, code: Tensor) -> dict[str, np.
     `mask` (H,W): what the mask network thinks of the real photo, and `truth` (H,W,3)."""
     w, h = scene.wh[photo].tolist()
     img = torch.tensor([photo], device=scene.c2w.device)
-    parts, n = [], CHUNK
-    if img.is_cuda:
-        n = int(np.clip(torch.cuda.mem_get_info()[0] // RAY_BYTES, CHUNK, 2 ** 18))
+    free = torch.cuda.mem_get_info()[0] if img.is_cuda else 0
+    parts, n = [], int(np.clip(free // RAY_BYTES, CHUNK, 2 ** 18))
     for pixel in torch.arange(w * h, device=img.device).split(n):
         rays = make_rays(scene, img.expand(len(pixel)), pixel)
         out = model.render(rays, code.expand(len(pixel), -1))
         out |= dict(mask=model.mask_of(rays, img), truth=rays.rgb)
-        parts.append({k: v for k, v in out.items() if len(v) == len(pixel)})
+        parts.append({k: v for k, v in out.items() if v[0].numel() in (1, 3)})  # not the samples'
     whole = {k: torch.cat([p[k] for p in parts]).float().cpu().numpy() for k in parts[0]}
     return {k: v.reshape(h, w, *v.shape[1:]) for k, v in whole.items()}
 
@@ -1761,11 +1752,10 @@ def extract_mesh(model: GeoNVS, resolution: int = 0) -> tuple[np.ndarray, np.nda
     volume = torch.ones_like(cached)
     for index in torch.nonzero(near).split(2 ** 16) if near.any() else ():  # (P,3)
         volume[tuple(index.T)] = model.sdf(index * (2 / n) - 1.0)[0]
-    cubes = torch.ones_like(near[1:, 1:, 1:])  # (n,n,n): were all of its corners evaluated?
-    for corner in CORNERS.tolist():
-        cubes &= near[tuple(slice(c, n + c) for c in corner)]
+    far, high, low = (F.max_pool3d(v[None], 2, 1)[0] for v in (-near.float(), volume, -volume))
+    cubes = (far < 0) & (high > 0) & (low >= 0)  # (n,n,n): all corners evaluated, s changes sign
     cubes = F.pad(cubes, (1, 0) * 3)  # skimage looks a cube up at its last corner
-    if not cubes.any() or not (volume < 0).any():
+    if not cubes.any():
         return np.zeros((0, 3)), np.zeros((0, 3), int), np.zeros((0, 3), np.uint8)
     vertices, faces, _, _ = marching_cubes(volume.cpu().numpy(), 0, mask=cubes.cpu().numpy(),
                                            gradient_direction="descent")
@@ -1795,10 +1785,7 @@ def write_ply(path: Path, vertices: np.ndarray, faces: np.ndarray, colors: np.nd
 
 def write_png(path: Path, picture: np.ndarray) -> None:
     """RGB uint8 picture to a file."""
-    def write(tmp):
-        if not cv2.imwrite(str(tmp), picture[:, :, ::-1]):
-            raise OSError("OpenCV could not write the picture")
-    atomic_write(path, write)
+    atomic_write(path, lambda tmp: cv2.imwrite(str(tmp), picture[:, :, ::-1]))
 
 
 def colormap(value: np.ndarray, low: float, high: float) -> np.ndarray:
@@ -1812,9 +1799,9 @@ def tiles_of(model, f: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     tiles = {"photo": to_uint8(f["truth"]), "render": to_uint8(f["rgb"]),
              "mask M": colormap(f["mask"], 0, 1)}
     if "normal" in f:
-        signal = model.cfg.lam_grad * f["e_grad"] + model.cfg.lam_lap * f["e_curv"]
-        centre, spread = model.calibration.tolist()
-        phi = 1 / (1 + np.exp(-(signal - centre) / spread))
+        cfg, errors = model.cfg, [torch.as_tensor(f[k]) for k in ("e_grad", "e_curv")]
+        calibration = model.calibration.cpu() if cfg.gpl == "calibrated" else None
+        phi = edge_indicator(*errors, cfg.lam_grad, cfg.lam_lap, calibration).numpy()
         tiles["geometry map"] = colormap(f["opacity"] * phi, 0, 1)
     tiles["depth"] = colormap(1 / f["depth"], *np.quantile(1 / f["depth"], (0.02, 0.98)))
     if "normal" in f:
@@ -1873,8 +1860,9 @@ def finish(model, scene: Scene, cfg: Config, state: dict, energy: dict, run: Pat
         model_bytes=sum(p.numel() * p.element_size() for p in model.parameters()) + structure,
         peak_memory_bytes=torch.cuda.max_memory_allocated() if is_gpu else peak_rss(),
         protocol=f"appearance fitted on the {fitted}, scored on the right half",
-        torch=torch.__version__, python=platform.python_version(), config=asdict(cfg),
-        commit=subprocess.run(git, capture_output=True, text=True).stdout.strip() or None)
+        torch=torch.__version__, python=sys.version.split()[0], config=asdict(cfg),
+        commit=shutil.which("git") and subprocess.run(
+            git, capture_output=True, text=True).stdout.strip() or None)
     if scene.info["kind"] == "toy":
         metrics |= toy_truth(model, scene)
     write_text(run / "metrics.json", json.dumps(metrics, indent=1))
@@ -1992,7 +1980,8 @@ def run_once(given: dict, run: Path) -> dict:
 def matrix(kind: str, rows: dict[str, dict], given: dict, seeds: int, workers: int = 1) -> dict:
     """Metrics, a list over seeds, of every row (settings by name). workers: CPU processes that
     train side by side, a thread each, which is faster than one after the other with all threads."""
-    find_scene(make_config(given))  # made once, before the processes start
+    if not find_scene(make_config(given))["is_test"].any():  # made once, before processes start
+        raise UserError("experiments need held-out photos: give a split file, see README")
     folder = Path("runs") / kind
     jobs = [(given | row | dict(seed=seed), folder / f"{name}-{seed}".replace(" ", "_"))
             for name, row in rows.items() for seed in range(seeds)]
@@ -2135,8 +2124,7 @@ def ablation(given: dict, seeds: int, workers: int) -> None:
                  octree_bytes="octree, bytes", rays_per_second="training, rays/s")
     figure, axes = plt.subplots(1, len(shown), figsize=(15, 0.33 * len(table) + 1), sharey=True)
     for axis, (key, label) in zip(axes, shown.items()):
-        mean, std = ([math.nan if r[k] is None else r[k] for r in table]
-                     for k in (key, key + "_std"))
+        mean, std = (np.array([r[k] for r in table], float) for k in (key, key + "_std"))
         axis.barh([r["row"] for r in table], mean, xerr=std, color=COLORS[0])
         axis.axvline(mean[0], color="black", lw=1)
         axis.set(xlabel=label, xlim=(np.nanmin(mean) - 1, None) if key == "psnr" else None)
@@ -2163,8 +2151,7 @@ def stress(given: dict, seeds: int, workers: int) -> None:
         for i, method in enumerate(STRESS_METHODS):
             mine = [r for r in table if (r["knob"], r["method"]) == (knob, method)]
             for axis, key in zip(pair, ("psnr", "sdf_error")):
-                mean, std = ([math.nan if r[k] is None else r[k] for r in mine]
-                             for k in (key, key + "_std"))
+                mean, std = (np.array([r[k] for r in mine], float) for k in (key, key + "_std"))
                 axis.errorbar(range(len(values)), mean, std, color=COLORS[i], marker="os^Dv<>"[i],
                               ms=4, capsize=2, label=method)
                 axis.set_xticks(range(len(values)), values)
@@ -2192,8 +2179,7 @@ class Parser(argparse.ArgumentParser):
 
 def make_parser() -> argparse.ArgumentParser:
     parser = Parser(description=__doc__.split("\n\n")[0], allow_abbrev=False,
-                    argument_default=argparse.SUPPRESS,
-                    formatter_class=argparse.ArgumentDefaultsHelpFormatter)
+                    argument_default=argparse.SUPPRESS)
     for f in fields(Config):
         more = dict(type=type(f.default), choices=f.metadata["choices"])
         if f.type == "bool":
@@ -2212,18 +2198,14 @@ def make_parser() -> argparse.ArgumentParser:
 
 
 def pick_device(name: str) -> torch.device:
-    if name == "auto":
-        name = "cuda" if torch.cuda.is_available() else "cpu"
-    try:
-        device = torch.device(name)
-    except RuntimeError:
-        raise UserError(f"--device {name} is unknown: use auto, cpu, cuda or cuda:N") from None
-    if device.type not in ("cpu", "cuda"):
-        raise UserError(f"--device {name} is not supported: use auto, cpu, cuda or cuda:N")
-    is_there = torch.cuda.is_available() and LOCAL_RANK < torch.cuda.device_count()
-    if device.type == "cuda" and not is_there:
-        raise UserError("--device cuda: no GPU for this process: use cpu, or a torch with CUDA")
-    return torch.device("cuda", LOCAL_RANK) if device.type == "cuda" and RANKS > 1 else device
+    count = torch.cuda.device_count() if torch.cuda.is_available() else 0
+    names = ["cpu", *(f"cuda:{i}" for i in range(count))]
+    chosen = ("cuda" if count else "cpu") if name == "auto" else name
+    if chosen == "cuda" or chosen in names[1:] and RANKS > 1:
+        chosen = f"cuda:{LOCAL_RANK}"  # each process has its own
+    if chosen not in names:
+        raise UserError(f"--device {name} is not there: this machine has {', '.join(names)}")
+    return torch.device(chosen)
 
 
 def scene_name(cfg: Config) -> str:
@@ -2233,10 +2215,6 @@ def scene_name(cfg: Config) -> str:
 def find_scene(cfg: Config) -> dict:
     """The scene of a configuration: data/<name>.npz, made on first use. Raises UserError."""
     name = scene_name(cfg)
-    if not cfg.data and name not in SCENES:
-        near = difflib.get_close_matches(name, SCENES, 1)
-        raise UserError(f"--scene {name} is unknown: use one of {', '.join(SCENES)}"
-                        + (f"; did you mean {near[0]}?" if near else ""))
     where = f"-{zlib.crc32(str(Path(cfg.data).resolve()).encode()):08x}" if cfg.data else ""
     path = Path("data") / f"{name}{where}.npz"  # two folders of one name are two scenes
     scene = data_prep.read_scene(path) if path.exists() else None
@@ -2311,16 +2289,15 @@ def make_config(given: dict) -> Config:
 
 def main(argv: list[str] | None = None) -> None:
     given = vars(make_parser().parse_args(argv))
-    names = ("resume", "render", "chart", "front", "ablation", "stress", "seeds")
-    commands = {k: given.pop(k) for k in names if k in given}
+    commands = {k: given.pop(k) for k in set(given) - {f.name for f in fields(Config)}}
     cfg, seeds = make_config(given), commands.get("seeds", 3)
     check(cfg)
     device = pick_device(cfg.device)
-    workers = 1 if device.type == "cuda" else os.cpu_count()
+    workers = 1 if device.type == "cuda" or RANKS > 1 else os.cpu_count()
     timed = dict(minutes=2.0, steps=10 ** 6, curve=True) | given  # one at a time, all threads
+    if device.type == "cuda":
+        torch.cuda.set_device(device)
     if RANKS > 1:
-        if device.type == "cuda":
-            torch.cuda.set_device(device)
         dist.init_process_group("cpu:gloo,cuda:nccl" if device.type == "cuda" else "gloo")
         sys.stdout = open(os.devnull, "w") if RANK else sys.stdout
     run = Path("runs") / (cfg.name or f"{scene_name(cfg)}-{cfg.method}-{cfg.seed}")

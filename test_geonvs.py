@@ -3170,6 +3170,31 @@ def test_hanerf_codes_come_from_the_photos_in_any_batch(scene):
     close(codes[7], model.encode(torch.tensor([7]))[0], atol=1e-5)
 
 
+def test_a_uniform_grid_is_as_fine_as_its_memory_allows(scene):
+    sizes = {}
+    for max_mb in (0.3, 3.0, 100.0):
+        octree = new_model(scene, grid="uniform", levels=3, max_mb=max_mb).sdf.octree
+        sizes[octree.levels] = octree.bytes() / 2 ** 20
+        assert octree.bytes() <= 1.2 * max_mb * 2 ** 20 and len(octree.cells[-1]) == octree.resolution(octree.levels - 1) ** 3
+    assert list(sizes) == [1, 2, 3]
+
+
+def test_a_model_without_codes_has_none_to_learn(scene):
+    off, on = (new_model(scene, appearance=how).appearance.weight for how in ("off", "on"))
+    assert off.numel() == 0 and not off.requires_grad and on.numel() > 0 and on.requires_grad
+
+
+def test_a_photo_of_odd_size_reaches_the_mask_network(scene):
+    model = new_model(scene._replace(thumbs=scene.thumbs[:, :, :17, :17]), mask_px=17)
+    model.step = 4
+    assert model.losses(*batch(scene), 0.5, generator())[0].isfinite()
+
+
+def test_health_without_visible_points_says_nothing_of_them(scene):
+    none = np.zeros(0, np.int32)
+    assert new_model(with_facts(scene, track_photo=none, track_point=none)).health() == {}
+
+
 # ---- 9 energy meter ------------------------------------------------------------------------------------
 
 class Bench:
@@ -3289,6 +3314,16 @@ def test_nvml_is_asked_for_torchs_gpu_in_millijoules_and_milliwatts(monkeypatch)
     meter = nvml(monkeypatch, nvmlDeviceGetHandleByUUID=asked.append)
     assert meter.source == "nvml" and meter.counter() == 7 and meter.idle_w == 30
     assert asked in (["GPU-abc"], [b"GPU-abc"])
+
+
+def test_a_gpu_without_an_energy_counter_reads_none(monkeypatch, capsys):
+    class NVMLError(Exception):
+        pass
+
+    def refuse(gpu):
+        raise NVMLError("Not Supported")
+    meter = nvml(monkeypatch, NVMLError=NVMLError, nvmlDeviceGetTotalEnergyConsumption=refuse)
+    assert meter.report()["energy_wh"] is None and "Not Supported" in capsys.readouterr().out
 
 
 def test_gpu_without_pynvml_reads_none(monkeypatch, capsys):
@@ -4135,6 +4170,8 @@ def test_mesh_of_an_empty_scene_is_empty(warm):
         model.sdf.lin2.bias.fill_(0.4)
     model.refresh_cache(0, 1)
     assert [len(part) for part in g.extract_mesh(model, 16)] == [0, 0, 0]
+    constant_sdf(model, -1e-3)  # near a surface everywhere, but never on its other side
+    assert [len(part) for part in g.extract_mesh(model, 16)] == [0, 0, 0]
 
 
 def read_ply(path):
@@ -4293,7 +4330,7 @@ def test_a_chart_trains_all_methods_for_the_same_time(tmp_path, monkeypatch, fla
 def test_a_run_of_other_settings_is_not_taken_for_this_one(tmp_path, monkeypatch):
     run, calls = Path(finished(tmp_path / "a", method="geonvsw", psnr=12.5)), []
     monkeypatch.setattr(g, "execute", lambda cfg, arrays, run: calls.append(cfg))
-    monkeypatch.setattr(g, "find_scene", lambda cfg: {})
+    monkeypatch.setattr(g, "find_scene", lambda cfg: dict(is_test=np.array([True])))
     g.run_once(dict(steps=2), run)
     assert [cfg.steps for cfg in calls] == [2]
 
@@ -4327,7 +4364,7 @@ def test_stress_fills_its_table_and_picture(tmp_path, monkeypatch, brief):
     monkeypatch.setattr(g, "CALM", SMALL_TOY)
     monkeypatch.setattr(g, "STRESS", dict(pose_noise=(0.0, 2.0), amp=("off", "on")))
     monkeypatch.setattr(g, "STRESS_METHODS", {"full": {}, "no mask": dict(mask="off")})
-    monkeypatch.setattr(g, "find_scene", lambda cfg: {})
+    monkeypatch.setattr(g, "find_scene", lambda cfg: dict(is_test=np.array([True])))
     g.stress({k: v for k, v in (TINY | dict(steps=2)).items()}, 1, 1)
     head, *rows = [line.split(",") for line in (tmp_path / "stress.csv").read_text().splitlines()]
     rows = [dict(zip(head, row)) for row in rows]
@@ -4480,6 +4517,27 @@ def test_two_folders_of_one_name_are_two_scenes(desk, monkeypatch, arrays):
 def test_a_baseline_of_a_scene_without_points_ends_in_words_or_works(scene):
     model = baseline(scene._replace(points=scene.points[:0]), "nerfw")
     assert math.isfinite(model.far)
+
+
+def test_a_machine_without_git_gets_its_metrics(desk, monkeypatch):
+    monkeypatch.setenv("PATH", "")
+    assert command(*FLAGS, "--steps=1", "--name=a") == 0
+    assert json.loads((desk / "runs" / "a" / "metrics.json").read_text())["commit"] is None
+
+
+def test_a_device_is_taken_if_it_is_there(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    picked = {name: str(g.pick_device(name)) for name in ("auto", "cpu", "cuda", "cuda:1")}
+    assert picked == {"auto": "cuda:0", "cpu": "cpu", "cuda": "cuda:0", "cuda:1": "cuda:1"}
+    with pytest.raises(UserError, match="cuda:0, cuda:1"):
+        g.pick_device("cuda:2")
+
+
+def test_experiments_without_held_out_photos_say_so(monkeypatch):
+    monkeypatch.setattr(g, "find_scene", lambda cfg: dict(is_test=np.array([False])))
+    with pytest.raises(UserError, match="held-out"):
+        g.matrix("a", {"full": {}}, {}, 1)
 
 
 @pytest.mark.parametrize("name", [f.name for f in dataclasses.fields(g.Config)])
