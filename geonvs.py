@@ -1333,8 +1333,8 @@ def make_optimizer(model: Method) -> torch.optim.Adam:
 
 
 def set_learning_rate(optimizer, step: int, progress: float) -> None:
-    """Linear warm-up over 100 steps, then a cosine down to 5 %."""
-    factor = min(1, (step + 1) / 100) * (0.05 + 0.95 * (1 + math.cos(math.pi * progress)) / 2)
+    """Linear warm-up over 20 steps, then a cosine down to 5 %."""
+    factor = min(1, (step + 1) / 20) * (0.05 + 0.95 * (1 + math.cos(math.pi * progress)) / 2)
     for group in optimizer.param_groups:
         group["lr"] = group["base_lr"] * factor
 

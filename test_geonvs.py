@@ -3803,8 +3803,8 @@ def test_learning_rate_warms_up_linearly_and_falls_to_five_percent():
     def rate(step, progress):
         g.set_learning_rate(optimizer, step, progress)
         return optimizer.param_groups[0]["lr"]
-    assert rate(0, 0) == pytest.approx(0.02) and rate(49, 0) == pytest.approx(1.0)
-    assert rate(99, 0) == rate(500, 0) == pytest.approx(2.0)
+    assert rate(0, 0) == pytest.approx(0.1) and rate(9, 0) == pytest.approx(1.0)
+    assert rate(19, 0) == rate(500, 0) == pytest.approx(2.0)
     assert rate(500, 0.5) == pytest.approx(2 * (0.05 + 0.95 / 2)) and rate(999, 1.0) == pytest.approx(0.1)
 
 
