@@ -4131,11 +4131,21 @@ def test_sdf_error_of_a_shifted_surface_is_the_shift(scene):
     assert g.toy_truth(model, scene)["sdf_error"] == pytest.approx(0.01, rel=1e-3)
 
 
+def test_validation_is_the_mean_of_the_photos_own_psnr(scene, monkeypatch):
+    monkeypatch.setattr(g, "fit_codes", lambda model, scene, photos, *more: torch.zeros(len(photos), 1))
+    photos = scene.photos(True)
+    off = {photos[0].item(): 0.01, photos[1].item(): 0.1}  # 40 and 20 dB
+    model = SimpleNamespace(render=lambda rays, code: dict(
+        rgb=rays.rgb + torch.tensor([off[i] for i in rays.img.tolist()])[:, None]))
+    assert g.validate(model, scene, photos, None)[1] == pytest.approx(30, abs=1e-3)
+
+
 def test_rendering_a_photo_keeps_its_shape_and_pixel_order_whatever_the_chunk(warm, scene, monkeypatch):
     for photo in (0, 1):
         whole = g.render_photo(warm, scene, photo, warm.appearance.weight[photo])
         w, h = scene.wh[photo].tolist()
         assert whole["rgb"].shape == (h, w, 3) and whole["mask"].shape == whole["depth"].shape == (h, w)
+        assert "eikonal" not in whole  # figures of samples would fill the memory of many photos
         assert np.array_equal(g.to_uint8(whole["truth"][3, 5]), pixel_of(scene, photo, 5, 3))
     monkeypatch.setattr(g, "CHUNK", 100)
     close(g.render_photo(warm, scene, 1, warm.appearance.weight[1])["rgb"], whole["rgb"], atol=1e-4)
