@@ -35,7 +35,7 @@ Where the printed paper is departed from, the line carries its tag:
   [D11] samples are drawn from a cached SDF volume; no second network pass along the ray
   [D12] test photos: appearance fitted on the left half, scored on the right half
   [D13] normals come from differentiating the trilinear weights; --normals fd is the paper's choice
-  [D14] the mask network learns every few steps from the remembered errors of whole photos
+  [D14] the mask network learns every few steps from remembered, averaged errors of whole photos
 """
 from __future__ import annotations
 
@@ -125,7 +125,7 @@ class Config:
     lam_lps: float = opt(1e-5, "weight of the Lipschitz loss, log form [D5] [R]")
     lam_off: float = opt(1e-3, "weight of the off-surface loss [R]")
     lam_sfm: float = opt(0.3, "weight of |s(p)| at SfM points [D10]")
-    lam_mask: float = opt(0.09, "weight of mean M: the excess L1 error that masks a pixel [D7]")
+    lam_mask: float = opt(0.08, "weight of mean M: the excess L1 error that masks a pixel [D7]")
     lam_bimodal: float = opt(1e-4, "weight of the pull of M to 0 and 1 (Ha-NeRF's digit loss) [R]")
     lr_grid: float = opt(1e-2, "learning rate of octree features")
     lr_net: float = opt(2e-3, "learning rate of networks and codes")
@@ -776,7 +776,6 @@ def worth_splitting(octree: Octree, level: int, hits: Tensor, bound: float) -> T
 REFINE_AT = (0.1, 0.2, 0.3, 0.45, 0.6)  # shares of training at which the octree is refined
 SPLIT_RAYS = 6  # recent rays that end in a cell before it is split
 HIDDEN = 6.0  # zeta |s| from where on the field is not seen: sigmoid(-6) = 0.0025
-MASK_FROM = 0.2  # share of training after which the mask may act: before, every pixel is wrong
 
 
 class GeoNVS(Method):
@@ -817,7 +816,7 @@ class GeoNVS(Method):
             cache=torch.zeros(1, 1, n, n, n),  # SDF on a dense grid, for placing samples [D11]
             hits=torch.full((2 ** 18, 5), 2.0),  # where recent rays ended, their error, pixel size
             logits=torch.full((I, 1, m, m), -9.0),  # last output of the mask network
-            seen=torch.full((I, 2, m, m), -1.0))  # last error and Phi by pixel
+            seen=torch.full((I, 4, m, m), -1.0))  # last residual and Phi by pixel; -1: no ray yet
         for name, value in memory.items():
             self.register_buffer(name, value)
         self.to(dev)
@@ -861,16 +860,16 @@ class GeoNVS(Method):
             adam.step()
         self.refresh_cache(0, 1)
 
-    def losses(self, rays: Rays, pick: Tensor, progress: float, gen: torch.Generator):
+    def losses(self, rays: Rays, pick: Tensor, gen: torch.Generator):
         """The objective, Eq. 5: its weighted sum, and by name the raw terms and health signals. The
         terms that teach M come from mask_objective, every few steps [D14]."""
         cfg, R, K, dev = self.cfg, len(rays.o), len(self.sfm), rays.o.device
         jitter = torch.rand(R, cfg.samples + cfg.bg_samples, generator=gen, device=dev)  # (R,S+B)
         out = in_shares(lambda *v: render_rays(self, *v), rays, self.appearance(rays.img), jitter)
         e_grad, e_curv, hit = out["e_grad"], out["e_curv"], out["hit"]  # (R,)
-        error = (out["rgb"] - rays.rgb).abs().mean(1)  # (R,) L1
-        is_masking = self.use_mask and progress > MASK_FROM
-        mask = mask_at(self.logits[pick], rays.uv) * is_masking  # (R,)
+        residual = out["rgb"] - rays.rgb  # (R,3)
+        error = residual.abs().mean(1)  # (R,) L1
+        mask = mask_at(self.logits[pick], rays.uv) * self.use_mask  # (R,)
         calibrate(cfg.lam_grad * e_grad + cfg.lam_lap * e_curv, self.calibration)
         calibration = self.calibration if cfg.gpl == "calibrated" else None
         edge = edge_indicator(e_grad, e_curv, cfg.lam_grad, cfg.lam_lap, calibration)  # (R,)
@@ -889,8 +888,8 @@ class GeoNVS(Method):
                  + cfg.lam_lps * raw["lps"] + cfg.lam_off * raw["off"] + cfg.lam_sfm * raw["sfm"])
         misfit = error.detach().nan_to_num(0, 0, 0)  # (R,) what is remembered stays finite
         self.level.lerp_(misfit.quantile(0.25), 0.02)
-        if is_masking:
-            self.remember(rays, misfit, edge.nan_to_num(0, 0, 0))
+        if self.use_mask:
+            self.remember(rays, residual.detach().nan_to_num(0, 0, 0), edge.nan_to_num(0, 0, 0))
             if self.step % cfg.mask_every == 0:
                 total = total + self.mask_objective(pick)
         slot = (self.step * R + torch.arange(R, device=dev)) % len(self.hits)  # (R,)
@@ -898,28 +897,30 @@ class GeoNVS(Method):
         told = torch.stack([(1 - mask) * misfit, pixel], 1)  # (R,2)
         self.hits[slot] = torch.cat([out["x"], told], 1).nan_to_num(2, 2, 2)
         health = dict(zeta=self.deviation(), opacity=out["opacity"].mean(),
-                      miss=1 - hit.float().mean(), mse=((out["rgb"] - rays.rgb) ** 2).mean())
+                      miss=1 - hit.float().mean(), mse=(residual ** 2).mean())
         return total, {k: v.detach() for k, v in (raw | health).items()}
 
-    def remember(self, rays: Rays, error: Tensor, edge: Tensor) -> None:
-        """Keeps error and Phi (R,) where the mask network will look for them."""
+    def remember(self, rays: Rays, residual: Tensor, edge: Tensor) -> None:
+        """Keeps residual (R,3) and Phi (R,) where the mask network will look for them."""
         m = self.seen.shape[-1]
         col, row = (rays.uv * m).long().clamp(max=m - 1).unbind(1)  # (R,)
-        self.seen[rays.img, :, row, col] = torch.stack([error, edge], 1)
+        self.seen[rays.img, :, row, col] = torch.cat([residual, edge[:, None]], 1)
 
     def mask_objective(self, pick: Tensor) -> Tensor:
         """The terms of Eq. 5 that hold M, over all pixels of photos (B,) that rays have seen. [D14]
         Eq. 5 is linear in M: M = 1 costs a pixel its intensity and GPL and saves it its error. As a
         sigmoid hardly moves at 0 or 1, price times M is minimised through its logistic surrogate:
-        the same sign, so the same optimum, but a slope that never vanishes. Errors are averaged
-        over 3x3 pixels first: a person is a blob, a misplaced edge is a line."""
+        the same sign, so the same optimum, but a slope that never vanishes. Errors are signed means
+        over 3x3 pixels, of the worst channel: what a blurred model lacks cancels, people do not.
+        The price falls with the level of usual errors: at first all pixels are wrong."""
         cfg, logits = self.cfg, self.cgnet(self.scene.thumbs[pick].float() / 255)  # (B,1,h,w)
         self.logits[pick] = logits.detach()
-        error, edge = self.seen[pick].split(1, 1)  # (B,1,h,w)
-        known = (error >= 0).float()  # (B,1,h,w)
-        total, count = F.avg_pool2d(torch.cat([error * known, known], 1), 3, 1, 1).split(1, 1)
-        error = total / count.clamp(min=0.1)  # (B,1,h,w)
-        price = cfg.lam_mask + 2 * self.level + cfg.lam_gpl * edge - error  # (B,1,h,w) [D7]
+        residual, edge = self.seen[pick].split((3, 1), 1)  # (B,3,h,w), (B,1,h,w)
+        known = (edge >= 0).float()  # (B,1,h,w)
+        around = F.avg_pool2d(torch.cat([residual * known, known], 1), 3, 1, 1)  # (B,4,h,w)
+        mean = around[:, :3] / around[:, 3:].clamp(min=0.1)  # (B,3,h,w)
+        error = mean.abs().amax(1, keepdim=True)  # (B,1,h,w)
+        price = cfg.lam_mask + 3 * self.level + cfg.lam_gpl * edge - error  # (B,1,h,w) [D7]
         slope = F.softplus(torch.where(price > 0, logits, -logits))  # (B,1,h,w)
         pull = cfg.lam_bimodal * bimodality(logits.sigmoid())
         return (price.abs() * slope * known).mean() + pull
@@ -1106,7 +1107,7 @@ class NeRFW(Method):
                     beta=(before * alpha_t * beta).sum(1) + 0.03, sigma_t=sigma_t.mean(1),
                     transient=(before * alpha_t).sum(1))
 
-    def losses(self, rays: Rays, pick: Tensor, progress: float, gen: torch.Generator):
+    def losses(self, rays: Rays, pick: Tensor, gen: torch.Generator):
         """NeRF-W Eq. 13: squared error over learned variance, its log, a price on transients."""
         jitter = torch.rand(len(rays.o), 2 * self.cfg.samples, generator=gen, device=rays.o.device)
         out = in_shares(self.render, rays, self.codes()[rays.img], jitter, self.transient(rays.img))
@@ -1155,7 +1156,7 @@ class HaNeRF(NeRFW):
         pixel = (uv[:, 1] * (h - 1)).round().long() * w + (uv[:, 0] * (w - 1)).round().long()
         return make_rays(self.scene, pick.expand(len(pixel)), pixel), pick
 
-    def losses(self, rays: Rays, pick: Tensor, progress: float, gen: torch.Generator):
+    def losses(self, rays: Rays, pick: Tensor, gen: torch.Generator):
         """Ha-NeRF Eq. 9: masked colour, a falling price on masks, codes that survive a render."""
         R, side = len(rays.o), math.isqrt(self.cfg.rays)
         jitter = torch.rand(R, 2 * self.cfg.samples, generator=gen, device=rays.o.device)
@@ -1409,7 +1410,7 @@ def training_step(model: Method, optimizer, photos: Tensor, state: dict, progres
     is_half = cfg.amp == "on" or cfg.amp == "auto" and device.type == "cuda"
     half = half_dtype(device)
     with torch.autocast(device.type, half, enabled=is_half):
-        loss, logs = model.losses(rays, pick, progress, gen)
+        loss, logs = model.losses(rays, pick, gen)
     scale = LOSS_SCALE if is_half and half == torch.float16 else 1.0
     optimizer.zero_grad()
     (scale * loss).backward()
