@@ -1942,7 +1942,7 @@ STRESS = {  # and one knob turned at a time
     "pose_noise": (0.0, 1.0, 4.0), "amp": ("off", "on")}
 KNOB_UNITS = dict(occluders="share of occluders", exposure="exposure spread", amp="half precision",
                   photos="training photos", pose_noise="pose noise, px")
-SMALL = dict(steps=300, rays=256, mask_px=64, bg_samples=8)  # half a minute with scoring
+SMALL = dict(steps=300, rays=256, mask_px=64, mask_every=2, bg_samples=8)  # half a minute each
 STRESS_METHODS = {piece: PIECES[piece] | SMALL for piece in
                   ("full", "no GPL", "literal GPL", "no mask", "no appearance")}
 STRESS_METHODS |= {method: RIVALS[f"{method} tuned"] | dict(minutes=0.5, steps=10 ** 6)
