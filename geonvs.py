@@ -125,7 +125,7 @@ class Config:
     lam_lps: float = opt(1e-5, "weight of the Lipschitz loss, log form [D5] [R]")
     lam_off: float = opt(1e-3, "weight of the off-surface loss [R]")
     lam_sfm: float = opt(0.3, "weight of |s(p)| at SfM points [D10]")
-    lam_mask: float = opt(0.08, "weight of mean M: the excess L1 error that masks a pixel [D7]")
+    lam_mask: float = opt(0.08, "weight of mean M: the excess error that masks a pixel [D7]")
     lam_bimodal: float = opt(1e-4, "weight of the pull of M to 0 and 1 (Ha-NeRF's digit loss) [R]")
     lr_grid: float = opt(1e-2, "learning rate of octree features")
     lr_net: float = opt(2e-3, "learning rate of networks and codes")
