@@ -2,8 +2,8 @@
 
     python data_prep.py toy --occluders 0.4     -> data/toy.npz; every knob of make_toy is a flag
     python data_prep.py brandenburg --download  -> data/brandenburg.npz, from an archive of 5 GB
-    python data_prep.py my_photos --sfm         raw photos, posed by pycolmap -> data/my_photos.npz
-    python data_prep.py my_scene                my_scene/dense/{images,sparse} -> data/my_scene.npz
+    python data_prep.py my_photos --sfm         raw photos, by pycolmap -> data/my_photos-*.npz
+    python data_prep.py my_scene                my_scene/dense/{images,sparse} -> the same
 
 A scene is one .npz. I photos, N pixels, K points, T observations; R rays, P parts:
 
@@ -12,7 +12,7 @@ A scene is one .npz. I photos, N pixels, K points, T observations; R rays, P par
     wh           int32 (I,2)      width, height [px]
     K            float64 (I,4)    fx fy cx cy [px]; the centre of the first pixel is (0.5, 0.5)
     c2w          float64 (I,3,4)  camera to world, normalised; OpenCV: x right, y down, z forward
-    near         float32 (I,)     0.8 x the 2 % quantile of the distances to the photo's own points
+    near         float32 (I,)     0.8 x the 2 % quantile of the photo's points' distances, >= 0.02
     is_test      bool (I,)        held out from training
     name         str (I,)         file names
     points       float32 (K,3)    SfM points, normalised
@@ -60,11 +60,19 @@ def atomic_write(path, write):
         if write(part) is False:   # how cv2.imwrite says no
             raise OSError("encoding failed")
         os.replace(part, path)
-    except OSError as e:
-        raise UserError(f"cannot write {path} ({e.strerror or e}): free or choose a place") from e
+    except (OSError, RuntimeError) as e:   # torch.save has RuntimeErrors for a full disk
+        why = getattr(e, "strerror", None) or e
+        raise UserError(f"cannot write {path} ({why}): free or choose a place") from e
     finally:
         if part.exists():
             part.unlink()
+
+
+def scene_path(scene, is_folder):
+    """data/<scene>.npz; of two folders with one name each has its own."""
+    folder = Path(scene).resolve()
+    where = f"-{zlib.crc32(str(folder).encode()):08x}" if is_folder else ""
+    return Path("data") / f"{folder.name}{where}.npz"
 
 
 def write_scene(path, scene):
@@ -323,8 +331,8 @@ def make_toy(seed=0, size=96, photos=48, test=8, occluders=0.05, exposure=1.0, p
     but the landmark, before black."""
     knobs = dict(locals())
     need(0 <= occluders <= 0.6 and 0 <= exposure <= 2 and min(size / 16, photos / 4) >= 1
-         and min(test, seed, pose_noise) >= 0, "the toy needs occluders in 0..0.6, exposure in "
-         "0..2, size >= 16, photos >= 4, and no negative seed, test or pose_noise")
+         and min(test, seed) >= 0 and 0 <= pose_noise < math.inf, "the toy needs occluders in "
+         "0..0.6, exposure in 0..2, size >= 16, photos >= 4, no negative seed, test or pose_noise")
     camera, taste, people, sfm, shake = (np.random.default_rng([seed, k]) for k in range(5))
     count = photos + test                                    # a stream each: no knob moves another
     angles = 200 * (np.arange(count) + camera.uniform(.1, .9, count)) / count - 100
@@ -544,7 +552,8 @@ def read_photo(path, camera, uv, downscale):
         image = cv2.undistort(image, M, bend)
         if len(uv):
             uv = cv2.undistortPoints(uv[:, None] - 0.5, M, bend, P=M)[:, 0] + 0.5
-    small = max(w // downscale, 1), max(h // downscale, 1)
+    small = w // downscale, h // downscale
+    need(min(small) >= 2, f"--downscale {downscale} leaves nothing of {path.name}: use a smaller")
     image = cv2.cvtColor(cv2.resize(image, small, interpolation=cv2.INTER_AREA), cv2.COLOR_BGR2RGB)
     ratio = np.array(small) / (w, h)
     return image, K * np.tile(ratio, 2), uv * ratio
@@ -566,7 +575,8 @@ def prepare(folder, downscale=2, split=None):
     need(downscale >= 1, f"--downscale is a whole number from 1, not {downscale}")
     cameras, photos, points = read_colmap(sparse)
     tables = [Path(split)] if split else sorted(folder.glob("*.tsv"))
-    need(len(tables) < 2, f"{folder} has {len(tables)} split files; choose: --split {tables[-1:]}")
+    need(len(tables) < 2, f"{folder} has {len(tables)} split files: keep one, or name one by "
+         "data_prep.py --split")
     here = sorted(name for name in photos if (root / "images" / name).is_file())
     report(set(photos) - set(here), "of the model are not on disk")
     if tables:
@@ -691,7 +701,7 @@ def main(argv=None):
         how = {"action": argparse.BooleanOptionalAction} if value is True else {"type": type(value)}
         p.add_argument(f"--{key}", default=None, help=f"toy, default {value}", **how)
     a = p.parse_args(argv)
-    out = a.out or f"data/{Path(a.scene).resolve().name}.npz"
+    out = a.out or scene_path(a.scene, a.scene not in ("toy", *SCENES))
     set_knobs = {key: value for key in knobs if (value := getattr(a, key)) is not None}
     try:
         need(a.scene == "toy" or not set_knobs, f"--{', --'.join(set_knobs)}: for the toy only")
@@ -706,8 +716,8 @@ def main(argv=None):
         else:
             scene = prepare(a.scene, a.downscale, a.split)
         write_scene(out, scene)
-    except UserError as e:
-        print(f"error: {e}", file=sys.stderr)
+    except (UserError, OSError, KeyboardInterrupt) as e:
+        print(f"error: {e or 'stopped'}", file=sys.stderr)
         sys.exit(2)
     print(f"{out}: {len(scene['wh'])} photos, {scene['is_test'].sum()} of them for testing, "
           f"{len(scene['rgb']) / 1e6:.2f} million pixels, {len(scene['points'])} points\n"

@@ -54,7 +54,6 @@ import subprocess
 import sys
 import threading
 import time
-import zlib
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, field, fields
 from multiprocessing import get_context
@@ -94,7 +93,7 @@ class Config:
     seed: int = opt(0, "seed of everything random")
     device: str = opt("auto", "auto, cpu, cuda or cuda:N")
     steps: int = opt(4000, "training steps")
-    minutes: float = opt(0.0, "training budget in minutes, 0: until --steps is reached")
+    minutes: float = opt(0.0, "training budget in minutes, instead of --steps if above 0")
     downscale: int = opt(2, "integer factor by which photos are made smaller (benchmarks use 2)")
     rays: int = opt(512, "rays per step, of all processes together")
     photos: int = opt(8, "photos per step; the mask network sees these whole")
@@ -322,12 +321,9 @@ class Octree(nn.Module):
         return ((x / (2 * self.half) + 0.5) * n).long().clamp(0, n - 1)
 
     def around(self, ijk: Tensor, level: int) -> Tensor:
-        """Cells (P,3) and all their neighbours, each once, in the order of appearance: (Q,3)."""
+        """Cells (P,3) of a level and all their neighbours, some repeatedly: (27P,3)."""
         step = torch.cartesian_prod(*[torch.arange(-1, 2, device=ijk.device)] * 3)  # (27,3)
-        near = (ijk[:, None] + step).reshape(-1, 3).clamp(0, self.resolution(level) - 1)  # (27P,3)
-        key, order = self.key(near, level).sort(stable=True)
-        is_first = F.pad(key[1:] != key[:-1], (1, 0), value=True)[:len(key)]  # (27P,) in its key
-        return near[order[is_first].sort()[0]]
+        return (ijk[:, None] + step).reshape(-1, 3).clamp(0, self.resolution(level) - 1)
 
     def build(self, split_keys: list[Tensor]) -> Tensor:
         """Makes nodes and corners from the keys of the split cells of each level but the last. New
@@ -780,7 +776,7 @@ HIDDEN = 6.0  # zeta |s| from where on the field is not seen: sigmoid(-6) = 0.00
 
 class GeoNVS(Method):
     """The paper's model: what it learns, and what it caches to be fast."""
-    def __init__(self, cfg: Config, scene: Scene, gen: torch.Generator | None = None):
+    def __init__(self, cfg: Config, scene: Scene):
         super().__init__()
         self.cfg, self.scene, self.refined = cfg, scene, 0
         self.use_mask, dev = cfg.mask != "off", scene.c2w.device
@@ -825,7 +821,8 @@ class GeoNVS(Method):
         return dict(refined=self.refined, use_mask=self.use_mask)
 
     def set_extra_state(self, state: dict) -> None:
-        self.refined, self.use_mask = state["refined"], state["use_mask"]
+        self.refined = state["refined"]
+        self.use_mask = state["use_mask"] if self.cfg.mask == "auto" else self.use_mask
 
     def octrees(self) -> list[Octree]:
         return [part.octree for part in (self.sdf, self.background) if part is not None]
@@ -1053,7 +1050,7 @@ class NeRFW(Method):
 
     code_dim, use_mask = 48, True
 
-    def __init__(self, cfg: Config, scene: Scene, gen: torch.Generator):
+    def __init__(self, cfg: Config, scene: Scene):
         super().__init__()
         self.cfg, self.scene = cfg, scene
         self.coarse, self.fine = (RadianceField(cfg.hidden, self.code_dim) for _ in range(2))
@@ -1152,7 +1149,7 @@ class HaNeRF(NeRFW):
         corner = torch.rand(2, generator=gen, device=photos.device) * (1 - size)
         grid = torch.linspace(0, 1, math.isqrt(self.cfg.rays), device=photos.device)
         uv = torch.cartesian_prod(grid, grid).flip(1) * size + corner  # (R,2)
-        w, h = self.scene.wh[pick[0]]
+        w, h = self.scene.wh[pick].T  # (1,), (1,)
         pixel = (uv[:, 1] * (h - 1)).round().long() * w + (uv[:, 0] * (w - 1)).round().long()
         return make_rays(self.scene, pick.expand(len(pixel)), pixel), pick
 
@@ -1183,12 +1180,11 @@ class HaNeRF(NeRFW):
 
 class EnergyMeter:
     """Joules between start() and stop(), by an energy counter and by integrated power samples.
-    counter() returns joules and may wrap at `wrap`; power() returns watts, integrated by the
+    counter() returns joules, power() watts, integrated by the
     trapezoid rule every `period` seconds. Without either the energy is None, never 0. Windows add
     up: evaluation can be left out, and a resumed run goes on counting."""
-    def __init__(self, source=None, counter=None, power=None, wrap=math.inf, period=0.5,
-                 clock=time.monotonic):
-        self.source, self.counter, self.power, self.wrap = source, counter, power, wrap
+    def __init__(self, source=None, counter=None, power=None, period=0.5, clock=time.monotonic):
+        self.source, self.counter, self.power = source, counter, power
         self.period, self.clock, self.lock = period, clock, threading.Lock()
         self.joules, self.sampled_joules = 0.0 if counter else None, 0.0 if power else None
         self.idle_w = power() if power else None  # read before any work
@@ -1199,7 +1195,7 @@ class EnergyMeter:
         with self.lock:
             now = self.clock(), self.counter and self.counter(), self.power and self.power()
             if self.last and self.joules is not None:
-                self.joules += (now[1] - self.last[1]) % self.wrap
+                self.joules += now[1] - self.last[1]
             if self.last and self.sampled_joules is not None:
                 self.sampled_joules += (now[2] + self.last[2]) / 2 * (now[0] - self.last[0])
             self.last = now
@@ -1350,13 +1346,13 @@ def save_checkpoint(path: Path, cfg: Config, model, optimizer, gen, state: dict)
         octrees=[o.split_keys for o in model.octrees()], rng=gen.get_state(), state=state), tmp))
 
 
-def read_checkpoint(path: Path, device="cpu") -> dict:
+def read_checkpoint(path: Path) -> dict:
     """A checkpoint's dictionary: tensors and plain values, never code. Raises UserError."""
     if not path.exists():
         raise UserError(f"{path} does not exist: nothing to resume, start without --resume")
     try:
         data_prep.refuse_bomb(path)
-        saved = dict(torch.load(path, map_location=device, weights_only=True))
+        saved = dict(torch.load(path, map_location="cpu", weights_only=True))
         config, step = saved["config"], saved["state"]["step"]
         kinds = {f.name: (float, int) if f.type == "float" else type(f.default)
                  for f in fields(Config)}
@@ -1375,17 +1371,19 @@ def restore(saved: dict, path: Path, model, optimizer, gen: torch.Generator) -> 
     """Puts a checkpoint back into model, optimiser and generator; returns its state."""
     try:
         for octree, keys in zip(model.octrees(), saved["octrees"], strict=True):
-            octree.build(keys)
+            octree.build([k.to(octree.features.device) for k in keys])
         model.load_state_dict(saved["model"])
         if optimizer is not None:
             for group, new in zip(optimizer.param_groups, model.groups(), strict=True):
                 group["params"] = new["params"]
             optimizer.load_state_dict(saved["optimizer"])
+            for group, new in zip(optimizer.param_groups, model.groups()):
+                group["base_lr"] = new["lr"]  # flags may have changed it
             for p, moments in optimizer.state.items():
                 shapes = dict(step=torch.Size(), exp_avg=p.shape, exp_avg_sq=p.shape)
                 if {k: v.shape for k, v in moments.items()} != shapes:
                     raise ValueError("Adam's moments have other shapes")
-            gen.set_state(saved["rng"].cpu())
+            gen.set_state(saved["rng"])
         return saved["state"]
     except (KeyError, IndexError, ValueError, RuntimeError, TypeError, AttributeError) as error:
         raise UserError(f"{path} does not fit this scene and these settings "
@@ -1438,19 +1436,23 @@ def train(cfg: Config, scene: Scene, run: Path, saved: dict | None = None):
     torch.set_flush_denormal(True)  # vanishing weights would otherwise slow a CPU down
     torch.manual_seed(cfg.seed)
     gen = torch.Generator(device).manual_seed(cfg.seed)
-    model = METHODS[cfg.method][0](cfg, scene, gen)
+    model = METHODS[cfg.method][0](cfg, scene)
     optimizer, meter = make_optimizer(model), make_meter(device)
-    state = dict(step=0, seconds=0.0, joules=None, sampled_joules=None, dropped=0, curve=[])
+    state = dict(step=0, seconds=0.0, joules=None, sampled_joules=None, dropped=0, curve=[],
+                 codes=None)
     checkpoint, log_path = run / "checkpoint.pt", run / "log.jsonl"
     if saved is not None:
         state |= restore(saved, checkpoint, model, optimizer, gen)
         state |= dict(joules=0.0, sampled_joules=0.0) if RANK else {}  # what all spent counts once
         meter.joules = state["joules"] if meter.counter else None  # all of it was measured, or None
         meter.sampled_joules = state["sampled_joules"] if meter.power else None
+    elif not RANK:  # nothing of a former run may be taken for this one's
+        for name in ("checkpoint.pt", "metrics.json"):
+            (run / name).unlink(missing_ok=True)
     lines = log_path.read_text().splitlines(True) if saved and log_path.exists() else []
     write_text(log_path, "".join(k for k in lines if k.endswith("\n")
                                  and json.loads(k)["step"] <= state["step"]))
-    photos, held_out, codes = scene.photos(False), scene.photos(True), None  # (B,)
+    photos, held_out = scene.photos(False), scene.photos(True)  # (B,)
     dropped = torch.tensor(state["dropped"], device=device)
     streak, warned = torch.zeros_like(dropped), set()  # void steps in a row; warnings given
     last_line = since = time.perf_counter()
@@ -1473,9 +1475,9 @@ def train(cfg: Config, scene: Scene, run: Path, saved: dict | None = None):
     try:
         while True:
             seconds, is_stopped = agreed((clock(), stop.is_set()))
-            spent = seconds / (60 * cfg.minutes) if cfg.minutes else 0
-            progress = max(state["step"] / cfg.steps, spent)
-            if progress >= 1 or is_stopped:
+            share = seconds / (60 * cfg.minutes) if cfg.minutes else state["step"] / cfg.steps
+            progress = min(share, 1.0)
+            if progress == 1 or is_stopped:
                 break
             logs, is_dropped = training_step(model, optimizer, photos, state, progress, gen)
             dropped += is_dropped
@@ -1485,7 +1487,8 @@ def train(cfg: Config, scene: Scene, run: Path, saved: dict | None = None):
             if cfg.curve and len(held_out) and seconds > 4 * 1.6 ** len(state["curve"]):
                 state["seconds"] = clock()
                 meter.stop()  # looking costs neither time nor energy
-                codes, value = validate(model, scene, held_out, codes) if RANK == 0 else (None, 0)
+                state["codes"], value = (None, 0) if RANK else validate(
+                    model, scene, held_out, state["codes"])
                 state["curve"].append(dict(step=state["step"], seconds=state["seconds"], psnr=value,
                                            wh=meter.report()["energy_wh"]))
                 meter.start()
@@ -1580,10 +1583,10 @@ def make_lpips(device) -> LPIPS | None:
     try:
         weights = [torch.hub.load_state_dict_from_url(url, map_location="cpu", progress=False,
                    weights_only=True) for url in (LPIPS.TRUNK, LPIPS.HEADS)]
-    except OSError as error:  # urllib's errors are OSErrors
-        print(f"  lpips is null: its weights could not be downloaded ({error})")
+        return LPIPS().load(*weights).to(device)
+    except Exception as error:  # no network, or a damaged file: any layer can fail
+        print(f"  lpips is null: its weights could not be downloaded or read ({error})")
         return None
-    return LPIPS().load(*weights).to(device)
 
 
 def half_pixels(scene: Scene, photo: int, left: bool) -> Tensor:
@@ -1697,7 +1700,7 @@ def evaluate(model, scene: Scene, cfg: Config, lpips: LPIPS | None) -> dict:
         name, frame = str(scene.raw["name"][photo]), render_photo(model, scene, photo, code)
         seconds.append(time.perf_counter() - begin)
         rows.append(dict(name=name) | score(frame, lpips, scene.c2w.device))
-        frames.append((name, frame))
+        frames += [(name, frame)] if len(frames) < 3 else []  # for the panel
     keys = ("psnr", "psnr_floor", "psnr_mean_color", "ssim", "lpips")
     fps = 1 / float(np.median(seconds)) if seconds else None
     means = {k: summary(rows, k)[0] for k in keys}
@@ -1834,7 +1837,7 @@ def panel(model, frames: list[tuple[str, dict]], height: int = 180) -> np.ndarra
 def finish(model, scene: Scene, cfg: Config, state: dict, energy: dict, run: Path) -> dict:
     """Scores a trained model and writes metrics.json, panel.png and mesh.ply below run."""
     scores = evaluate(model, scene, cfg, make_lpips(scene.c2w.device))
-    frames = [(f"held out: {name}", frame) for name, frame in scores.pop("frames")[:3]]
+    frames = [(f"held out: {name}", frame) for name, frame in scores.pop("frames")]
     busy = scene.photos(False)
     if hasattr(model, "logits"):  # training photos with most on the mask
         busy = busy[model.logits[busy].sigmoid().mean((1, 2, 3)).argsort(descending=True)]
@@ -1894,6 +1897,8 @@ def film(model, scene: Scene, kind: str, path: Path, count: int = 72) -> None:
     w, h = (scene.wh[view] // 2 * 2).tolist()
     if kind == "orbit":
         poses, codes = camera_path(c2w, count), codes.mean(0).expand(count, -1)
+    elif not codes.numel():
+        raise UserError("this run has no appearance codes: --render orbit shows what it has")
     else:
         u = torch.linspace(0, len(photos) - 1.001, count)[:, None].to(codes)
         i = u[:, 0].long()
@@ -1945,7 +1950,7 @@ KNOB_UNITS = dict(occluders="share of occluders", exposure="exposure spread", am
 SMALL = dict(steps=300, rays=256, mask_px=64, mask_every=2, bg_samples=8)  # half a minute each
 STRESS_METHODS = {piece: PIECES[piece] | SMALL for piece in
                   ("full", "no GPL", "literal GPL", "no mask", "no appearance")}
-STRESS_METHODS |= {method: RIVALS[f"{method} tuned"] | dict(minutes=0.5, steps=10 ** 6)
+STRESS_METHODS |= {method: RIVALS[f"{method} tuned"] | dict(minutes=0.5)
                    for method in ("nerfw", "hanerf")}
 COLORS = "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#999999"
 FIGURES = ("psnr", "psnr_floor", "ssim", "sdf_error", "mask_iou", "mask_static", "octree_bytes",
@@ -1955,7 +1960,10 @@ FIGURES = ("psnr", "psnr_floor", "ssim", "sdf_error", "mask_iou", "mask_static",
 def read_metrics(run: Path) -> dict:
     if not (run / "metrics.json").exists():
         raise UserError(f"{run} holds no metrics.json: give folders of finished runs")
-    return json.loads((run / "metrics.json").read_text())
+    metrics = json.loads((run / "metrics.json").read_text())
+    if "failed" not in metrics and metrics["psnr"] is None:
+        raise UserError(f"{run} has no scores, as its scene holds no photos out: see README")
+    return metrics
 
 
 def run_once(given: dict, run: Path) -> dict:
@@ -1963,8 +1971,9 @@ def run_once(given: dict, run: Path) -> dict:
     log.txt. A finished run of the same settings is read; one that diverged is a result, too."""
     toy, given = given.get("toy"), {k: v for k, v in given.items() if k != "toy"}
     cfg = make_config(given)
-    check(cfg)
-    if not (run / "metrics.json").exists() or read_metrics(run)["config"] != asdict(cfg):
+    done, source = run / "metrics.json", scene_file(cfg)
+    is_newer = done.exists() and source.exists() and source.stat().st_mtime > done.stat().st_mtime
+    if not done.exists() or is_newer and not toy or read_metrics(run)["config"] != asdict(cfg):
         run.mkdir(parents=True, exist_ok=True)
         with open(run / "log.txt", "w") as log, contextlib.redirect_stdout(log):
             try:
@@ -1986,6 +1995,8 @@ def matrix(kind: str, rows: dict[str, dict], given: dict, seeds: int, workers: i
     folder = Path("runs") / kind
     jobs = [(given | row | dict(seed=seed), folder / f"{name}-{seed}".replace(" ", "_"))
             for name, row in rows.items() for seed in range(seeds)]
+    for job, _ in jobs:  # a row that cannot work is refused before the first is run
+        check(make_config({k: v for k, v in job.items() if k != "toy"}))
     if workers == 1:
         done = [run_once(*job) for job in jobs]
     else:
@@ -2058,7 +2069,7 @@ def plot_curves(axis, groups: dict[str, list[dict]], unit: str, xlabel: str) -> 
     for i, (name, metrics) in enumerate(groups.items()):
         curves = [m["curve"] for m in metrics if m["curve"]]
         n = min(map(len, curves), default=0)
-        if n and all(c[0][unit] is not None for c in curves):
+        if n and all(point[unit] is not None for c in curves for point in c):
             x, y = (np.array([[p[k] for p in c[:n]] for c in curves]) for k in (unit, "psnr"))
             style = dict(color=COLORS[i % 8], marker="os^Dv"[i % 5], ls=("-", "--", ":")[i % 3])
             axis.plot(x.mean(0), y.mean(0), label=f"{name} ({len(curves)} seeds)", ms=4, **style)
@@ -2213,21 +2224,27 @@ def scene_name(cfg: Config) -> str:
     return Path(cfg.data).resolve().name if cfg.data else cfg.scene
 
 
+def scene_file(cfg: Config) -> Path:
+    return data_prep.scene_path(cfg.data or cfg.scene, bool(cfg.data))
+
+
 def find_scene(cfg: Config) -> dict:
-    """The scene of a configuration: data/<name>.npz, made on first use. Raises UserError."""
-    name = scene_name(cfg)
-    where = f"-{zlib.crc32(str(Path(cfg.data).resolve()).encode()):08x}" if cfg.data else ""
-    path = Path("data") / f"{name}{where}.npz"  # two folders of one name are two scenes
+    """The scene of a configuration from its file, made on first use or when the folder's split
+    file is newer. Raises UserError."""
+    path, is_toy = scene_file(cfg), not cfg.data and cfg.scene == "toy"
     scene = data_prep.read_scene(path) if path.exists() else None
-    if scene and (name == "toy" or json.loads(str(scene["info"]))["downscale"] == cfg.downscale):
+    tables = Path(cfg.data).glob("*.tsv") if cfg.data and scene else ()
+    is_old = any(table.stat().st_mtime > path.stat().st_mtime for table in tables)
+    if scene and not is_old and (
+            is_toy or json.loads(str(scene["info"]))["downscale"] == cfg.downscale):
         return scene
     print(f"making {path}")
     if cfg.data:
         scene = data_prep.prepare(cfg.data, cfg.downscale)
-    elif name == "toy":
+    elif is_toy:
         scene = data_prep.make_toy()
     else:
-        scene = data_prep.locate_and_prepare(name, "data", cfg.downscale)
+        scene = data_prep.locate_and_prepare(cfg.scene, "data", cfg.downscale)
     data_prep.write_scene(path, scene)
     return scene
 
@@ -2245,6 +2262,8 @@ def check(cfg: Config) -> None:
             raise UserError(f"--{name} {getattr(cfg, name)} is too small: use at least {bound}")
     if max(cfg.levels, cfg.bg_levels) > 9:
         raise UserError("--levels and --bg_levels go up to 9: 4096 cells a side")
+    if cfg.method == "hanerf" and math.isqrt(cfg.rays) ** 2 != cfg.rays:
+        raise UserError(f"--rays {cfg.rays} is no square, as hanerf's grid of rays needs: try 1024")
     if cfg.rays % cfg.photos:
         raise UserError(f"--rays {cfg.rays} must be a multiple of --photos {cfg.photos}")
 
@@ -2267,12 +2286,10 @@ def execute(cfg: Config, arrays, run: Path, saved: dict | None = None) -> dict:
 
 def render_film(kind: str, run: Path, given: dict) -> None:
     """Loads a finished run and films it."""
-    device = pick_device(given.get("device", "auto"))
-    saved = read_checkpoint(run / "checkpoint.pt", device)
+    saved = read_checkpoint(run / "checkpoint.pt")
     cfg = Config(**saved["config"] | given)
-    scene = load_scene(find_scene(cfg), device, cfg.mask_px)
-    gen = torch.Generator(device).manual_seed(cfg.seed)
-    model = METHODS[cfg.method][0](cfg, scene, gen)
+    scene = load_scene(find_scene(cfg), pick_device(cfg.device), cfg.mask_px)
+    model = METHODS[cfg.method][0](cfg, scene)
     restore(saved, run / "checkpoint.pt", model, None, None)
     film(model, scene, kind, run / f"{kind}.mp4")
 
@@ -2291,17 +2308,24 @@ def make_config(given: dict) -> Config:
 def main(argv: list[str] | None = None) -> None:
     given = vars(make_parser().parse_args(argv))
     commands = {k: given.pop(k) for k in set(given) - {f.name for f in fields(Config)}}
-    cfg, seeds = make_config(given), commands.get("seeds", 3)
+    cfg, seeds, saved = make_config(given), commands.get("seeds", 3), None
+    run = Path("runs") / (cfg.name or f"{scene_name(cfg)}-{cfg.method}-{cfg.seed}")
+    if "resume" in commands:
+        if {"preset", "tuned"} & set(given):
+            raise UserError("--preset and --tuned are for new runs: --resume keeps its settings")
+        saved = read_checkpoint(run / "checkpoint.pt")
+        cfg = Config(**saved["config"] | given)
     check(cfg)
+    if seeds < 1 or RANKS > 1 and {"chart", "front", "ablation", "stress"} & set(commands):
+        raise UserError("experiments need --seeds of at least 1 and one process, not torchrun")
     device = pick_device(cfg.device)
-    workers = 1 if device.type == "cuda" or RANKS > 1 else os.cpu_count()
-    timed = dict(minutes=2.0, steps=10 ** 6, curve=True) | given  # one at a time, all threads
+    workers = 1 if device.type == "cuda" else os.cpu_count()
+    timed = dict(minutes=2.0, curve=True) | given  # one at a time, all threads
     if device.type == "cuda":
         torch.cuda.set_device(device)
     if RANKS > 1:
         dist.init_process_group("cpu:gloo,cuda:nccl" if device.type == "cuda" else "gloo")
         sys.stdout = open(os.devnull, "w") if RANK else sys.stdout
-    run = Path("runs") / (cfg.name or f"{scene_name(cfg)}-{cfg.method}-{cfg.seed}")
     if commands.get("chart"):
         runs = [read_metrics(Path(run)) for run in commands["chart"]]
         names = [m["method"] + " tuned" * m["config"]["tuned"] for m in runs]
@@ -2319,9 +2343,6 @@ def main(argv: list[str] | None = None) -> None:
     elif "render" in commands:
         render_film(commands["render"], run, given)
     else:
-        saved = read_checkpoint(run / "checkpoint.pt", device) if "resume" in commands else None
-        cfg = Config(**saved["config"] | given) if saved else cfg
-        check(cfg)
         try:
             arrays = RANK or find_scene(cfg)
         finally:  # the others read what the first one made, or fail as it did
