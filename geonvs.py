@@ -10,7 +10,7 @@ the sections follow one ray from the pixel to the loss, then the training loop a
     torchrun --nproc_per_node 4 geonvs.py  on 4 GPUs that share the rays of each step
     python geonvs.py --help                every setting with its meaning, unit and source
 
-A run writes runs/<name>/: metrics.json, log.jsonl, checkpoint.pt, panel.png, mesh.ply.
+A run writes runs/<name>/: metrics.json, log.jsonl, checkpoint.pt, panel.png and a mesh.ply.
 
 Conventions, stated once
   world     the foreground is the unit sphere; x_file = x * scale + center leads back to SfM units
@@ -102,7 +102,7 @@ class Config:
     levels: int = opt(0, "octree levels, 0: from the pixel footprint at the surface")
     grid: str = opt("octree", "uniform: the same finest cell everywhere", "octree", "uniform")
     split_error: float = opt(2.0, "times the lower quartile of all rays' errors splits a cell")
-    max_mb: float = opt(1000.0, "most memory that the foreground octree may take, MiB")
+    max_mb: float = opt(1000.0, "memory up to which the foreground octree may grow, MiB")
     bg_levels: int = opt(3, "octree levels of the background")
     channels: int = opt(4, "feature channels per octree level")
     hidden: int = opt(64, "width of the MLPs")
