@@ -2172,7 +2172,8 @@ def stress(given: dict, seeds: int, workers: int) -> None:
         pair[1].set_xlabel(KNOB_UNITS[knob])
     axes[0, 0].set_ylabel("PSNR, dB")
     axes[1, 0].set_ylabel("SDF error, radii")
-    axes[0, 0].legend(fontsize=7)
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), ncol=7, loc="lower center",
+                  bbox_to_anchor=(0.5, -0.03))
     save_figure(figure, Path("stress.png"))
 
 
