@@ -60,9 +60,8 @@ def atomic_write(path, write):
         if write(part) is False:   # how cv2.imwrite says no
             raise OSError("encoding failed")
         os.replace(part, path)
-    except (OSError, RuntimeError) as e:   # torch.save has RuntimeErrors for a full disk
-        why = getattr(e, "strerror", None) or e
-        raise UserError(f"cannot write {path} ({why}): free or choose a place") from e
+    except OSError as e:
+        raise UserError(f"cannot write {path} ({e.strerror or e}): free or choose a place") from e
     finally:
         if part.exists():
             part.unlink()
@@ -717,7 +716,7 @@ def main(argv=None):
             scene = prepare(a.scene, a.downscale, a.split)
         write_scene(out, scene)
     except (UserError, OSError, KeyboardInterrupt) as e:
-        print(f"error: {e or 'stopped'}", file=sys.stderr)
+        print(f"error: {e}" if str(e) else "error: stopped; start again", file=sys.stderr)
         sys.exit(2)
     print(f"{out}: {len(scene['wh'])} photos, {scene['is_test'].sum()} of them for testing, "
           f"{len(scene['rgb']) / 1e6:.2f} million pixels, {len(scene['points'])} points\n"

@@ -1341,9 +1341,16 @@ def write_text(path: Path, text: str) -> None:
 
 
 def save_checkpoint(path: Path, cfg: Config, model, optimizer, gen, state: dict) -> None:
-    atomic_write(path, lambda tmp: torch.save(dict(
+    whole = dict(
         geonvs=1, config=asdict(cfg), model=model.state_dict(), optimizer=optimizer.state_dict(),
-        octrees=[o.split_keys for o in model.octrees()], rng=gen.get_state(), state=state), tmp))
+        octrees=[o.split_keys for o in model.octrees()], rng=gen.get_state(), state=state)
+
+    def write(tmp):
+        try:
+            torch.save(whole, tmp)
+        except RuntimeError as error:  # so torch reports a full disk
+            raise OSError(str(error)) from error
+    atomic_write(path, write)
 
 
 def read_checkpoint(path: Path) -> dict:
