@@ -2625,6 +2625,18 @@ def test_errors_are_remembered_where_the_mask_network_looks_for_them(warm, scene
     assert (model.seen[:, 3] >= 0).sum() == 2
 
 
+def test_a_step_remembers_residuals_with_their_signs(warm, scene):
+    """Of absolute values nothing would cancel out, and blur would be taken for people."""
+    model, (rays, pick) = copy.deepcopy(warm), batch(scene)
+    model.losses(rays, pick, generator())
+    out = g.render_rays(model, rays, model.appearance(rays.img), torch.rand(64, 12, generator=generator()))
+    m = model.seen.shape[-1]
+    col, row = (rays.uv * m).long().unbind(1)
+    got, want = model.seen[rays.img, :3, row, col], (out["rgb"] - rays.rgb).detach()
+    once = ((got - want).abs() < 1e-5).all(1)  # of two rays into one place the later one stays
+    assert once.float().mean() > 0.8 and (want[once] < -0.01).any() and (want[once] > 0.01).any()
+
+
 def test_where_rays_ended_is_remembered_with_what_the_mask_does_not_explain(warm, scene):
     model, (rays, pick), jitter = tuned(warm), batch(scene), torch.rand(64, 12, generator=generator())
     n = len(model.hits) // 64
