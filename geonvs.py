@@ -34,8 +34,8 @@ Where the printed paper is departed from, the line carries its tag:
   [D10] SfM points place the sphere, seed the octree and pull |s(p)| to zero
   [D11] samples are drawn from a cached SDF volume; no second network pass along the ray
   [D12] test photos: appearance fitted on the left half, scored on the right half
-  [D13] normals come from differentiating the trilinear weights; --normals fd is the paper's choice
-  [D14] the mask network learns every few steps from remembered, averaged errors of whole photos
+  [D13] exact normals by the trilinear weights, curvature where a ray ends; --normals fd: as printed
+  [D14] the mask learns every few steps, by a logistic surrogate, from averaged errors of photos
 """
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ import threading
 import time
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, field, fields
-from multiprocessing import get_context
+from multiprocessing import get_context, parent_process
 from pathlib import Path
 from typing import NamedTuple
 
@@ -238,6 +238,39 @@ def sphere_interval(rays: Rays) -> tuple[Tensor, Tensor, Tensor]:
     return t0, torch.maximum(closest + half * hit, t0), hit
 
 
+# torchrun starts RANKS processes. All draw the same random numbers and each works on own rows of a
+# step, so that together they do what one does; the first alone speaks, decides, scores and writes.
+RANK, LOCAL_RANK, RANKS = (int(os.environ.get(name, default)) for name, default in (
+    ("RANK", 0), ("LOCAL_RANK", 0), ("WORLD_SIZE", 1)))
+atomic_write = (lambda path, write: None) if RANK else atomic_write
+
+
+def agreed(value, source: int = 0):
+    """The value that one process has, for all of them."""
+    box = [value]
+    if RANKS > 1:
+        dist.broadcast_object_list(box, source)
+    return box[0]
+
+
+def in_shares(f, *rows) -> dict[str, Tensor]:
+    """f(*rows), from R rows to R rows by name: a process computes every RANKS-th, and all get all.
+    Gradients flow to own rows alone, RANKS-fold, as their mean over the processes is taken."""
+    if RANKS == 1:
+        return f(*rows)
+    own = f(*[Rays(*(v[RANK::RANKS] for v in r)) if isinstance(r, Rays) else r[RANK::RANKS]
+              for r in rows])
+    flat = torch.cat([v.reshape(len(v), -1) for v in own.values()], 1)  # (R/RANKS,columns)
+    flat.register_hook(lambda grad: RANKS * grad)
+    whole = flat.new_zeros(len(rows[-1]), flat.shape[1])  # (R,columns)
+    whole[RANK::RANKS] = flat.detach()
+    dist.all_reduce(whole)
+    whole[RANK::RANKS] = flat
+    parts = zip(own.items(), whole.split([v.shape[1:].numel() for v in own.values()], 1))
+    return {name: (part if v.requires_grad else part.detach()).reshape(-1, *v.shape[1:])
+            for (name, v), part in parts}
+
+
 # ---- 3 Octree: features on the corners of cells --------------------------------------------------
 
 CORNERS = torch.cartesian_prod(*[torch.arange(2)] * 3)  # (8,3), x slowest
@@ -274,9 +307,10 @@ class Interpolate(torch.autograd.Function):
     @staticmethod
     def backward(ctx, grad):  # (P,J,C)
         corner, w = ctx.saved_tensors
-        spread = torch.bmm(w.transpose(1, 2), grad)  # (P,8,C)
+        by_corner, is_single = w.transpose(1, 2), grad.shape[1] == 1  # (P,8,J)
+        spread = by_corner * grad if is_single else torch.bmm(by_corner, grad)  # (P,8,C)
         out = grad.new_zeros(ctx.rows, grad.shape[2])  # (V,C)
-        out.index_add_(0, corner.flatten(), spread.flatten(0, 1))
+        out.index_add_(0, corner.flatten().long(), spread.flatten(0, 1))
         out[0] = 0
         return out, None, None
 
@@ -355,6 +389,7 @@ class Octree(nn.Module):
         self.features = nn.Parameter(self.features.detach()[old_row])  # (V,C)
         self.row_key = row_key
         self.child, self.corner = torch.cat(child).int(), torch.cat(corner).int()  # (N,), (N,8)
+        self.active = sum(len(cells) > 0 for cells in self.cells)  # levels that have cells
         return old_row
 
     def split(self, level: int, ijk: Tensor) -> Tensor:
@@ -370,19 +405,21 @@ class Octree(nn.Module):
         return self.build(keys)
 
     def locate(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Corner rows (P,L,8) of the cells that hold x (P,3), and its place (P,L,3) 0..1 inside."""
+        """Corner rows (P,L,8) of the cells that hold x (P,3), and its place (P,L,3) 0..1 inside, on
+        the levels that have cells."""
         u = (x / (2 * self.half) + 0.5).clamp(0, 1 - 1e-6)  # (P,3)
-        at = u[:, None] * self.scale[:, None]  # (P,L,3) in cells
-        ijk = at.long()  # (P,L,3)
+        at = u[:, None] * self.scale[:self.active, None]  # (P,L,3) in cells
+        ijk = at.int()  # (P,L,3)
+        bit = ijk & 1  # (P,L,3)
+        octant = bit[..., 0] * 4 + bit[..., 1] * 2 + bit[..., 2]  # (P,L)
         nodes = [8 + (ijk[:, 0, 0] * self.root + ijk[:, 0, 1]) * self.root + ijk[:, 0, 2]]  # (P,)
-        for level in range(1, self.levels):
-            bit = ijk[:, level] & 1  # (P,3)
-            nodes.append(self.child[nodes[-1]] + bit[:, 0] * 4 + bit[:, 1] * 2 + bit[:, 2])  # (P,)
-        return self.corner[torch.stack(nodes, 1)].long(), at - ijk
+        for level in range(1, self.active):
+            nodes.append(self.child[nodes[-1]] + octant[:, level])  # (P,)
+        return self.corner[torch.stack(nodes, 1)], at - ijk
 
     def forward(self, x: Tensor, derivatives: bool = False) -> Tensor:
         """Features (P,L,J,C) at x (P,3); J = 1, or 4: value, its change per cell along x, y, z."""
-        P, L, J = len(x), self.levels, 4 if derivatives else 1
+        P, L, J = len(x), self.active, 4 if derivatives else 1
         corner, inside = self.locate(x)  # (P,L,8), (P,L,3)
         fx, fy, fz = inside.reshape(-1, 3).T.contiguous()  # (PL,)
         yz = fy * fz
@@ -390,7 +427,8 @@ class Octree(nn.Module):
         with torch.autocast(x.device.type, enabled=False):  # [D9] corners have float32 features
             w = basis @ resident(TRILINEAR, x.device)[:, :8 * J]  # (PL,8) to (PL,8J)
         out = Interpolate.apply(self.features, corner.reshape(-1, 8), w.reshape(-1, J, 8))
-        return out.reshape(P, L, J, self.features.shape[1])
+        out = out.reshape(P, L, J, self.features.shape[1])
+        return F.pad(out, (0, 0, 0, 0, 0, self.levels - L)) if L < self.levels else out
 
     def bytes(self) -> int:
         """Memory of features and of the structure that a query needs."""
@@ -460,8 +498,9 @@ def finite_differences(sdf, x: Tensor, eps: float, centre: Tensor | None = None)
     Taps sit at x + eps k, |k| = 1: their mean difference to the centre is eps^2/6 times the
     Laplacian, their k-weighted mean the gradient. centre: s(x) where the caller has it already."""
     k = resident(TETRAHEDRON, x.device).to(x.dtype)  # (4,3)
-    taps = sdf((x[:, None] + eps * k).reshape(-1, 3)).reshape(-1, 4)  # (P,4)
-    centre = sdf(x) if centre is None else centre  # (P,)
+    ends = x[:, None] + eps * (k if centre is not None else F.pad(k, (0, 0, 0, 1)))  # (P,4 or 5,3)
+    s = sdf(ends.reshape(-1, 3)).reshape(len(x), -1)  # (P,4 or 5)
+    taps, centre = s[:, :4], s[:, 4] if centre is None else centre  # (P,4), (P,)
     slope = (taps[:, :, None] * k).sum(1)  # (P,3) not taps @ k: autocast would round the taps [D9]
     grad = 0.75 / eps * slope  # (P,3); sum over taps of k k^T is 4/3 times the identity
     return grad, 6 / eps ** 2 * (taps.mean(1) - centre)  # (P,3), (P,)
@@ -629,10 +668,10 @@ def render_rays(model: "GeoNVS", rays: Rays, code: Tensor, jitter: Tensor) -> di
     depth = (w * t).sum(1) + trans * t1  # (R,)
     end = rays.o + depth.detach()[:, None] * rays.d  # (R,3) where the ray ends
     if cfg.normals == "fd":
-        e_curv = (w * lap.reshape(R, S).abs()).sum(1) * model.eps  # (R,)
+        e_curv = (w.detach() * lap.reshape(R, S).abs()).sum(1) * model.eps  # (R,)
     else:  # four taps where the ray ends, for the curvature alone
         _, lap = finite_differences(lambda y: model.sdf(y)[0], end, model.eps)  # (R,)
-        e_curv = lap.abs() * model.eps * opacity  # (R,)
+        e_curv = lap.abs() * model.eps * opacity.detach()  # (R,) flat, not transparent
     error = ((grad.norm(dim=1) - 1) ** 2).reshape(R, S)
     return dict(rgb=rgb + trans[:, None] * behind, opacity=opacity, depth=depth, hit=hit, x=end,
                 normal=(w[:, :, None] * normal.reshape(R, S, 3)).sum(1),
@@ -697,16 +736,19 @@ def mask_at(logits: Tensor, uv: Tensor) -> Tensor:
 def edge_indicator(e_grad: Tensor, e_curv: Tensor, lam_grad: float, lam_lap: float,
                    calibration: Tensor | None) -> Tensor:
     """Phi (R,) from the rays' eikonal error and curvature. Eq. 4 calibration (2,): centre and width
-    of the sigmoid. None is the literal reading: Phi then lies between 0.5 and 1 for every ray and
-    marks nothing. Detached [D3]: Phi is to hold back the mask, not to smooth geometry away."""
+    of the sigmoid. None is the literal reading: Phi then lies between 0.5 and 1 for every ray, a
+    price that tells no edges. Detached [D3]: it is to hold back the mask, not to smooth geometry."""
     x = (lam_grad * e_grad + lam_lap * e_curv).detach()  # (R,)
     return torch.sigmoid(x if calibration is None else (x - calibration[0]) / calibration[1])
+
+
+QUANTILES = torch.tensor([0.5, 0.75, 0.95])
 
 
 def calibrate(x: Tensor, calibration: Tensor, rate: float = 0.05) -> None:
     """Moves calibration (2,) to the batch's: 75th percentile and width (p95 - p50) / 4. [D3]"""
     x = x.detach().nan_to_num(0, 0, 0)  # (R,)
-    p50, p75, p95 = (x.quantile(q) for q in (0.5, 0.75, 0.95))
+    p50, p75, p95 = x.quantile(resident(QUANTILES, x.device))
     calibration.lerp_(torch.stack([p75, ((p95 - p50) / 4).clamp(min=1e-3)]), rate)
 
 
@@ -733,6 +775,7 @@ class Method(nn.Module):
     """What the training loop asks of a method, with the answers that most of them give."""
 
     step = 0  # number of the present step, set by the loop
+    adam = dict(betas=(0.9, 0.99), eps=1e-15)  # as is usual for feature grids (Instant-NGP)
 
     def octrees(self) -> list[Octree]:
         return []
@@ -790,7 +833,6 @@ class GeoNVS(Method):
         octree = Octree(1.0, levels, cfg.channels, dev)
         dense, radius = (1, 1.0) if is_octree else (levels, math.sqrt(3))
         seed_octree(octree, self.sfm, dense, (0.0, radius))  # [D10]
-        self.eps = octree.cell(levels - 1) / 2
         spread, sky = float(scene.raw["exposure_spread"]), torch.as_tensor(scene.raw["bg_color"])
         has_codes = cfg.appearance == "on" or cfg.appearance == "auto" and spread > 0.01
         A = cfg.appearance_dim * has_codes
@@ -810,12 +852,17 @@ class GeoNVS(Method):
             bg_color=sky.float().nan_to_num(0.5), calibration=torch.tensor([0.0, 1.0]),
             level=torch.tensor(0.1),  # running lower quartile of the L1 error
             cache=torch.zeros(1, 1, n, n, n),  # SDF on a dense grid, for placing samples [D11]
-            hits=torch.full((2 ** 18, 5), 2.0),  # where recent rays ended, their error, pixel size
+            hits=torch.full((max(2 ** 18, 512 * cfg.rays), 5), 2.0),  # ends of rays, errors, pixels
             logits=torch.full((I, 1, m, m), -9.0),  # last output of the mask network
             seen=torch.full((I, 4, m, m), -1.0))  # last residual and Phi by pixel; -1: no ray yet
         for name, value in memory.items():
             self.register_buffer(name, value)
         self.to(dev)
+
+    @property
+    def eps(self) -> float:
+        """Length of the taps of finite differences: half of the finest cell there is."""
+        return self.sdf.octree.cell(self.sdf.octree.active - 1) / 2
 
     def get_extra_state(self) -> dict:
         return dict(refined=self.refined, use_mask=self.use_mask)
@@ -933,9 +980,9 @@ class GeoNVS(Method):
         """Evaluates the SDF again on every parts-th slice of the cache, from slice `part`."""
         n = self.cache.shape[-1]
         line = torch.linspace(-1, 1, n, device=self.cache.device)  # (n,)
-        for i in range(part, n, parts):
-            x = torch.cartesian_prod(line[i:i + 1], line, line)  # (n^2,3)
-            self.cache[0, 0, i] = self.sdf(x)[0].reshape(n, n)
+        x = torch.cartesian_prod(line[part::parts], line, line)  # (P,3)
+        s = torch.cat([self.sdf(some)[0] for some in x.split(2 ** 15)])  # (P,)
+        self.cache[0, 0, part::parts] = s.reshape(-1, n, n)
 
     @torch.no_grad()
     def refine(self, optimizer: torch.optim.Optimizer) -> None:
@@ -958,7 +1005,7 @@ class GeoNVS(Method):
             bound = self.cfg.split_error * self.level
             new = octree.key(worth_splitting(octree, level, hits, bound), level)
             new = new[torch.isin(new, key[s.abs() < reach]) & ~torch.isin(new, keys[level])]
-            new = new[:room] if level <= 2 * self.refined + 1 else new[:0]
+            new = new[:room]
             room -= len(new)
             keys[level] = torch.cat([keys[level], new])
         keys = [k.to(hits.device) for k in agreed([k.cpu() for k in keys])]
@@ -1037,10 +1084,13 @@ class RadianceField(nn.Module):
         """Density (R,S), colour (R,S,3), bottleneck (R,S,W) at x (R,S,3), d (R,3), code (R,A)."""
         pe = positional(x, 15)  # (R,S,93)
         h = self.second(torch.cat([pe, self.first(pe)], 2))  # (R,S,W)
-        per_ray = torch.cat([positional(d, 4), code], 1)[:, None].expand(-1, x.shape[1], -1)
         neck = self.bottleneck(h)  # (R,S,W)
-        rgb = torch.sigmoid(self.color(torch.cat([neck, per_ray], 2)))  # (R,S,3)
-        return F.softplus(self.density(h)[..., 0]), rgb, neck
+        return F.softplus(self.density(h)[..., 0].float()), self.paint(neck, d, code), neck
+
+    def paint(self, neck: Tensor, d: Tensor, code: Tensor) -> Tensor:
+        """Colour (R,S,3) of samples with bottleneck (R,S,W), under an appearance code (R,A)."""
+        per_ray = torch.cat([positional(d, 4), code], 1)[:, None].expand(-1, neck.shape[1], -1)
+        return torch.sigmoid(self.color(torch.cat([neck, per_ray], 2)).float())
 
 
 class NeRFW(Method):
@@ -1048,7 +1098,7 @@ class NeRFW(Method):
     the paper: two networks, 48 + 16 code dims, losses, lambda_u = 0.01. From its PyTorch version:
     width 256, 64 + 64 samples, beta_min 0.03, Adam 5e-4, 1024 rays, SfM near and far."""
 
-    code_dim, use_mask = 48, True
+    code_dim, use_mask, adam = 48, True, dict(betas=(0.9, 0.999), eps=1e-8)
 
     def __init__(self, cfg: Config, scene: Scene):
         super().__init__()
@@ -1056,8 +1106,7 @@ class NeRFW(Method):
         self.coarse, self.fine = (RadianceField(cfg.hidden, self.code_dim) for _ in range(2))
         points = scene.points[::20] if len(scene.points) else scene.c2w.new_zeros(1, 3)
         reach = (points - scene.c2w[:, None, :, 3]).norm(dim=2)  # (I,K/20)
-        is_small = reach.numel() < 1e7  # what torch.quantile takes
-        self.far = float(reach.flatten().double().quantile(0.999) if is_small else reach.max())
+        self.register_buffer("far", reach.quantile(0.999, dim=1), persistent=False)  # (I,)
         self.make_heads(len(scene.wh))
         self.to(scene.c2w.device)
 
@@ -1077,7 +1126,7 @@ class NeRFW(Method):
         u = torch.full((R, 2 * n), 0.5, device=dev) if jitter is None else jitter
         u = (torch.arange(n, device=dev).repeat(2) + u) / n  # (R,2n) stratified twice
         edges = torch.linspace(0, 1, n + 1, device=dev)
-        edges = rays.near[:, None] + (self.far - rays.near)[:, None] * edges  # (R,n+1)
+        edges = rays.near[:, None] + (self.far[rays.img] - rays.near)[:, None] * edges  # (R,n+1)
         t = inverse_cdf(edges, torch.ones_like(edges[:, 1:]), u[:, :n])  # (R,n)
         out = self.pass_through(self.coarse, rays, t, code, None)
         more = inverse_cdf(edges, out["w"].detach() + 1e-3, u[:, n:])  # (R,n)
@@ -1092,7 +1141,7 @@ class NeRFW(Method):
         alpha = 1 - torch.exp(-sigma * dt)  # (R,S)
         if transient is None:
             w, _ = composite(alpha)  # (R,S)
-            return dict(rgb=(w[..., None] * rgb).sum(1), depth=(w * t).sum(1), w=w)
+            return dict(rgb=(w[..., None] * rgb).sum(1), depth=(w * t).sum(1), w=w, neck=neck)
         code_t = transient[:, None].expand(-1, t.shape[1], -1)  # (R,S,16)
         h = self.head_out(self.head(torch.cat([neck, code_t], 2)))  # (R,S,5)
         sigma_t, beta = F.softplus(h[..., 0]), F.softplus(h[..., 4])  # (R,S)
@@ -1109,7 +1158,7 @@ class NeRFW(Method):
         jitter = torch.rand(len(rays.o), 2 * self.cfg.samples, generator=gen, device=rays.o.device)
         out = in_shares(self.render, rays, self.codes()[rays.img], jitter, self.transient(rays.img))
         error = ((out["rgb"] - rays.rgb) ** 2).sum(1)  # (R,)
-        raw = dict(coarse=((out["coarse"] - rays.rgb) ** 2).mean() / 2,
+        raw = dict(coarse=((out["coarse"] - rays.rgb) ** 2).sum(1).mean() / 2,
                    rgb=(error / (2 * out["beta"] ** 2)).mean(),
                    beta=3 + torch.log(out["beta"]).mean(), sigma=0.01 * out["sigma_t"].mean())
         return summed(raw, mask=out["transient"].mean(), mse=error.mean() / 3)
@@ -1123,13 +1172,14 @@ class NeRFW(Method):
 class HaNeRF(NeRFW):
     """Ha-NeRF (Chen et al. 2022): appearance from a CNN over the photo, mask by an MLP of pixels.
     From the authors' code: network sizes, 64 + 64 samples, one 32x32 grid of rays per step, loss
-    weights, Adam 5e-4. Left out: the mode-seeking term (weight 1e-6)."""
+    weights, Adam 5e-4. Left out: the mode-seeking term (weight 1e-6), noise on densities."""
     def make_heads(self, photos: int) -> None:
         sizes = [(3, 64, 7, 1), (64, 128, 4, 2), *[(a, 256, 4, 2) for a in (128, 256, 256)]]
         convs = [m for a, b, k, s in sizes for m in (
             nn.Conv2d(a, b, k, s, (k - 1) // 2, padding_mode="reflect"), nn.ReLU())]
         self.encoder = nn.Sequential(*convs, nn.AdaptiveAvgPool2d(1),
                                      nn.Conv2d(256, self.code_dim, 1), nn.Flatten())
+        self.register_buffer("bank", torch.zeros(photos, self.code_dim))  # last code of each photo
         self.mask_code = nn.Embedding(photos, 128)
         self.mask_mlp = nn.Sequential(mlp(128 + 42, *[256] * 4), nn.Linear(256, 1), nn.Sigmoid())
 
@@ -1154,21 +1204,33 @@ class HaNeRF(NeRFW):
         return make_rays(self.scene, pick.expand(len(pixel)), pixel), pick
 
     def losses(self, rays: Rays, pick: Tensor, gen: torch.Generator):
-        """Ha-NeRF Eq. 9: masked colour, a falling price on masks, codes that survive a render."""
+        """Ha-NeRF Eq. 9: masked colour, a falling price on masks, codes that survive a render: of
+        the same rays in another photo's light."""
         R, side = len(rays.o), math.isqrt(self.cfg.rays)
         jitter = torch.rand(R, 2 * self.cfg.samples, generator=gen, device=rays.o.device)
         code = self.encode(pick)  # (1,A)
-        out = in_shares(self.render, rays, code.expand(R, -1), jitter)
+        other = self.bank[torch.randint(len(self.bank), (1,), generator=gen, device=pick.device)]
+        other = torch.where(other.any(), other, code.detach())  # (1,A) of another photo, once known
+        self.bank[pick] = code.detach().float()
+        out = in_shares(self.render, rays, code.expand(R, -1), jitter, other.expand(R, -1))
         mask = self.mask_of(rays, pick)  # (R,)
         error, coarse = (((out[k] - rays.rgb) ** 2).mean(1) for k in ("rgb", "coarse"))  # (R,)
-        window = out["rgb"].reshape(1, side, side, 3).permute(0, 3, 1, 2)
+        window = out["other"].reshape(1, side, side, 3).permute(0, 3, 1, 2)
         again = self.encoder(window * 2 - 1)  # (1,A)
         price = max(6e-3, 5e-2 * math.exp(-1e-3 * self.step))
         raw = dict(rgb=((1 - mask) * error).mean() / 2,
                    coarse=((1 - mask.detach()) * coarse).mean() / 2,
                    size=price * (mask ** 2).mean(), code=1e-5 * (code ** 2).mean(),
-                   again=1e-3 * (again - code.detach()).abs().mean())
+                   again=1e-3 * (again - other).abs().mean())
         return summed(raw, mask=mask.mean(), mse=error.mean())
+
+    def pass_through(self, field: RadianceField, rays: Rays, t: Tensor, code: Tensor,
+                     other: Tensor | None) -> dict[str, Tensor]:
+        """The static picture; with the codes (R,A) of another photo also its colours there."""
+        out = super().pass_through(field, rays, t, code, None)
+        neck, w = out.pop("neck").detach(), out["w"].detach()[..., None]  # only colours learn
+        return out if other is None else out | dict(
+            other=(w * field.paint(neck, rays.d, other)).sum(1))
 
     def mask_of(self, rays: Rays, pick: Tensor) -> Tensor:
         per_ray = torch.cat([self.mask_code(rays.img), positional(rays.uv, 10)], 1)
@@ -1180,9 +1242,9 @@ class HaNeRF(NeRFW):
 
 class EnergyMeter:
     """Joules between start() and stop(), by an energy counter and by integrated power samples.
-    counter() returns joules, power() watts, integrated by the
-    trapezoid rule every `period` seconds. Without either the energy is None, never 0. Windows add
-    up: evaluation can be left out, and a resumed run goes on counting."""
+    counter() returns joules; power() watts, integrated by the trapezoid rule every `period`
+    seconds. Without either the energy is None, never 0. Windows add up: evaluation can be left out,
+    and a resumed run goes on counting."""
     def __init__(self, source=None, counter=None, power=None, period=0.5, clock=time.monotonic):
         self.source, self.counter, self.power = source, counter, power
         self.period, self.clock, self.lock = period, clock, threading.Lock()
@@ -1247,17 +1309,21 @@ def rapl_meter(root: str = "/sys/class/powercap") -> EnergyMeter:
 
 def make_meter(device: torch.device) -> EnergyMeter:
     """NVML for a GPU, found by UUID whatever CUDA_VISIBLE_DEVICES says; RAPL for a CPU; or none."""
-    if device.type != "cuda":  # one process reads for its whole machine
-        return EnergyMeter("rapl", float) if LOCAL_RANK else rapl_meter()
+    if device.type != "cuda":  # one process reads for its whole machine; side by side none can tell
+        return EnergyMeter("rapl", float) if LOCAL_RANK else (
+            EnergyMeter() if parent_process() else rapl_meter())
     try:
         import pynvml
         pynvml.nvmlInit()
         uuid = torch.cuda.get_device_properties(device).uuid
         gpu = pynvml.nvmlDeviceGetHandleByUUID(f"GPU-{uuid}")
-        meter = EnergyMeter("nvml", lambda: pynvml.nvmlDeviceGetTotalEnergyConsumption(gpu) / 1e3,
-                            lambda: pynvml.nvmlDeviceGetPowerUsage(gpu) / 1e3)
-        meter.counter()  # vGPUs and GPUs before Volta have none
-        return meter
+        power = lambda: pynvml.nvmlDeviceGetPowerUsage(gpu) / 1e3
+        counter = lambda: pynvml.nvmlDeviceGetTotalEnergyConsumption(gpu) / 1e3
+        try:
+            counter()
+        except pynvml.NVMLError:  # vGPUs and GPUs before Volta have none
+            counter = None
+        return EnergyMeter("nvml", counter, power)
     except ImportError:
         print("  no GPU energy: pip install nvidia-ml-py")
     except pynvml.NVMLError as error:
@@ -1289,41 +1355,9 @@ HEALTH = {  # lowest and highest healthy value after a third of training, and wh
 class Diverged(UserError):
     """Training was stopped, as its losses or gradients were not finite."""
 
-# torchrun starts RANKS processes. All draw the same random numbers and each works on own rows of a
-# step, so that together they do what one does; the first alone speaks, decides, scores and writes.
-RANK, LOCAL_RANK, RANKS = (int(os.environ.get(name, default)) for name, default in (
-    ("RANK", 0), ("LOCAL_RANK", 0), ("WORLD_SIZE", 1)))
-atomic_write = (lambda path, write: None) if RANK else atomic_write
-
-
-def agreed(value, source: int = 0):
-    """The value that one process has, for all of them."""
-    box = [value]
-    if RANKS > 1:
-        dist.broadcast_object_list(box, source)
-    return box[0]
-
-
-def in_shares(f, *rows) -> dict[str, Tensor]:
-    """f(*rows), from R rows to R rows by name: a process computes every RANKS-th, and all get all.
-    Gradients flow to own rows alone, RANKS-fold, as their mean over the processes is taken."""
-    if RANKS == 1:
-        return f(*rows)
-    own = f(*[Rays(*(v[RANK::RANKS] for v in r)) if isinstance(r, Rays) else r[RANK::RANKS]
-              for r in rows])
-    flat = torch.cat([v.reshape(len(v), -1) for v in own.values()], 1)  # (R/RANKS,columns)
-    flat.register_hook(lambda grad: RANKS * grad)
-    whole = flat.new_zeros(len(rows[-1]), flat.shape[1])  # (R,columns)
-    whole[RANK::RANKS] = flat.detach()
-    dist.all_reduce(whole)
-    whole[RANK::RANKS] = flat
-    parts = zip(own.items(), whole.split([v.shape[1:].numel() for v in own.values()], 1))
-    return {name: (part if v.requires_grad else part.detach()).reshape(-1, *v.shape[1:])
-            for (name, v), part in parts}
-
 
 def make_optimizer(model: Method) -> torch.optim.Adam:
-    optimizer = torch.optim.Adam(model.groups(), betas=(0.9, 0.99), eps=1e-15, fused=True)
+    optimizer = torch.optim.Adam(model.groups(), **model.adam, fused=True)
     for group in optimizer.param_groups:
         group["base_lr"] = group["lr"]
     return optimizer
@@ -1356,7 +1390,8 @@ def save_checkpoint(path: Path, cfg: Config, model, optimizer, gen, state: dict)
 def read_checkpoint(path: Path) -> dict:
     """A checkpoint's dictionary: tensors and plain values, never code. Raises UserError."""
     if not path.exists():
-        raise UserError(f"{path} does not exist: nothing to resume, start without --resume")
+        raise UserError(f"{path} does not exist: train first, without --resume or --render, or name "
+                        "the run by the --data, --seed and --name that it was made with")
     try:
         data_prep.refuse_bomb(path)
         saved = dict(torch.load(path, map_location="cpu", weights_only=True))
@@ -1448,6 +1483,8 @@ def train(cfg: Config, scene: Scene, run: Path, saved: dict | None = None):
     state = dict(step=0, seconds=0.0, joules=None, sampled_joules=None, dropped=0, curve=[],
                  codes=None)
     checkpoint, log_path = run / "checkpoint.pt", run / "log.jsonl"
+    if device.type == "cuda":
+        torch.cuda.reset_peak_memory_stats(device)
     if saved is not None:
         state |= restore(saved, checkpoint, model, optimizer, gen)
         state |= dict(joules=0.0, sampled_joules=0.0) if RANK else {}  # what all spent counts once
@@ -1509,7 +1546,10 @@ def train(cfg: Config, scene: Scene, run: Path, saved: dict | None = None):
                 last_save = seconds
     finally:
         signal.signal(signal.SIGINT, handler)
+        if device.type == "cuda":
+            torch.cuda.synchronize()
         meter.stop()
+        spent = clock()
     save()
     if int(streak) >= PATIENCE:
         raise Diverged(f"the last {int(streak)} steps had no finite loss or gradient; {checkpoint} "
@@ -1517,7 +1557,7 @@ def train(cfg: Config, scene: Scene, run: Path, saved: dict | None = None):
                        "third of --lr_grid and --lr_net), half precision (--amp off), broken poses")
     if is_stopped:
         raise UserError(f"stopped at step {state['step']}; add --resume to go on")
-    state["seconds"] = clock()
+    state["seconds"] = spent
     return model, state, meter
 
 
@@ -1616,7 +1656,7 @@ def fit_codes(model, scene: Scene, photos: Tensor, codes: Tensor | None, steps: 
     gen, n = torch.Generator(scene.c2w.device).manual_seed(0), rays_per_photo
     if codes is None:
         codes = model.codes()[~scene.is_test].mean(0).expand(len(photos), -1)  # (B,A)
-    codes = codes.detach().clone().requires_grad_()
+    codes = codes.detach().to(scene.c2w.device, copy=True).requires_grad_()
     if codes.numel() == 0:
         return codes
     sides = (True, False) if protocol == "leaky" else (True,)
@@ -1653,9 +1693,10 @@ RAY_BYTES = 2 ** 20  # memory that a ray takes in rendering: NeRF-W at full size
 
 
 @torch.no_grad()
-def render_photo(model, scene: Scene, photo: int, code: Tensor) -> dict[str, np.ndarray]:
-    """A photo's view under an appearance code (A,): arrays (H,W,...) by name of render_rays. Adds
-    `mask` (H,W): what the mask network thinks of the real photo, and `truth` (H,W,3)."""
+def render_photo(model, scene: Scene, photo: int, code: Tensor,
+                 with_mask: bool = True) -> dict[str, np.ndarray]:
+    """A photo's view under an appearance code (A,): arrays (H,W,...) by name of render_rays, and
+    `truth` (H,W,3); with a mask also `mask` (H,W), what the method thinks of the real photo."""
     w, h = scene.wh[photo].tolist()
     img = torch.tensor([photo], device=scene.c2w.device)
     free = torch.cuda.mem_get_info()[0] if img.is_cuda else 0
@@ -1663,7 +1704,7 @@ def render_photo(model, scene: Scene, photo: int, code: Tensor) -> dict[str, np.
     for pixel in torch.arange(w * h, device=img.device).split(n):
         rays = make_rays(scene, img.expand(len(pixel)), pixel)
         out = model.render(rays, code.expand(len(pixel), -1))
-        out |= dict(mask=model.mask_of(rays, img), truth=rays.rgb)
+        out |= dict(truth=rays.rgb) | (dict(mask=model.mask_of(rays, img)) if with_mask else {})
         parts.append({k: v for k, v in out.items() if v[0].numel() in (1, 3)})  # not the samples'
     whole = {k: torch.cat([p[k] for p in parts]).float().cpu().numpy() for k in parts[0]}
     return {k: v.reshape(h, w, *v.shape[1:]) for k, v in whole.items()}
@@ -1704,7 +1745,8 @@ def evaluate(model, scene: Scene, cfg: Config, lpips: LPIPS | None) -> dict:
     codes = fit_codes(model, scene, photos, None, 128, cfg.protocol) if len(photos) else []  # (B,A)
     for photo, code in zip(photos.tolist(), codes):
         begin = time.perf_counter()
-        name, frame = str(scene.raw["name"][photo]), render_photo(model, scene, photo, code)
+        name = str(scene.raw["name"][photo])
+        frame = render_photo(model, scene, photo, code, hasattr(model, "cgnet"))
         seconds.append(time.perf_counter() - begin)
         rows.append(dict(name=name) | score(frame, lpips, scene.c2w.device))
         frames += [(name, frame)] if len(frames) < 3 else []  # for the panel
@@ -1807,8 +1849,9 @@ def colormap(value: np.ndarray, low: float, high: float) -> np.ndarray:
 
 def tiles_of(model, f: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """A rendered photo's pictures (H,W,3) uint8 by title."""
+    mask = f.get("mask", np.zeros_like(f["depth"]))  # baselines have none for held-out photos
     tiles = {"photo": to_uint8(f["truth"]), "render": to_uint8(f["rgb"]),
-             "mask M": colormap(f["mask"], 0, 1)}
+             "mask M": colormap(mask, 0, 1)}
     if "normal" in f:
         cfg, errors = model.cfg, [torch.as_tensor(f[k]) for k in ("e_grad", "e_curv")]
         calibration = model.calibration.cpu() if cfg.gpl == "calibrated" else None
@@ -1919,15 +1962,17 @@ def film(model, scene: Scene, kind: str, path: Path, count: int = 72) -> None:
         for pose, code in zip(poses, codes):
             moved = scene.c2w.clone()
             moved[view] = pose
-            frame = render_photo(model, scene._replace(c2w=moved), view, code)["rgb"]
+            frame = render_photo(model, scene._replace(c2w=moved), view, code, False)["rgb"]
             video.write(np.ascontiguousarray(to_uint8(frame)[:h, :w, ::-1]))
         video.release()
     atomic_write(path, write)
     print(f"wrote {path}")
 
 
-def peak_rss() -> int:
-    """Largest resident memory of this process, bytes."""
+def peak_rss() -> int | None:
+    """Largest resident memory of this process, bytes; None where several runs share a process."""
+    if parent_process():
+        return None
     import resource  # absent on Windows
     unit = 1 if sys.platform == "darwin" else 1024
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
