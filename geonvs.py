@@ -519,7 +519,7 @@ class LipschitzMLP(nn.Module):
         super().__init__()
         self.layers = nn.ModuleList(nn.Linear(a, b) for a, b in zip(sizes, sizes[1:]))
         bound = torch.stack([m.weight.detach().abs().sum(1).max() for m in self.layers])
-        self.c = nn.Parameter(torch.log(torch.expm1(2 * bound)))  # (layers,)
+        self.c = nn.Parameter(torch.log(torch.expm1(bound)))  # (layers,)
 
     def bounds(self) -> Tensor:
         """Lipschitz bound of each layer in the max norm; above 0, as the loss takes its log."""
