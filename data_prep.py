@@ -3,7 +3,7 @@
     python data_prep.py toy --occluders 0.4     -> data/toy.npz; every knob of make_toy is a flag
     python data_prep.py brandenburg --download  -> data/brandenburg.npz, from an archive of 5 GB
     python data_prep.py my_photos --sfm         raw photos, by pycolmap -> data/my_photos-*.npz
-    python data_prep.py my_scene                my_scene/dense/{images,sparse} -> the same
+    python data_prep.py my_scene                my_scene/[dense/]{images,sparse} -> the same
 
 A scene is one .npz. I photos, N pixels, K points, T observations; R rays, P parts:
 
@@ -19,7 +19,8 @@ A scene is one .npz. I photos, N pixels, K points, T observations; R rays, P par
     track_photo, track_point      int32 (T,): photo track_photo[j] (sorted) observes track_point[j]
     center, scale                 float64 (3,), (): x_world = x * scale + center
     footprint, exposure_spread, bg_color    what geonvs.py decides by; see statistics
-    info         JSON text        scene, kind (toy or colmap), downscale, reprojection_px, left_out
+    info         JSON text        scene, kind (toy or colmap), downscale, reprojection_px, left_out;
+                                  split: what --split named; of a toy its knobs
     depth        float16 (N,)     toy: true distance, normalised; inf is sky
     occluder     bool (N,)        toy: pixels that a passer-by covers
 
@@ -606,7 +607,7 @@ def prepare(folder, downscale=2, split=None):
     return finish(dict(rgb=np.concatenate(rgb), wh=wh, K=np.array(K), is_test=is_test, name=names),
                   np.array(c2w), points, *map(np.concatenate, tracks), [],
                   dict(scene=folder.resolve().name, kind="colmap", downscale=downscale,
-                       left_out=left_out))
+                       left_out=left_out, split=split and str(Path(split).resolve())))
 
 
 # ---- download, SfM, command line ----------------------------------------------------------------

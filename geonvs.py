@@ -12,6 +12,9 @@ the sections follow one ray from the pixel to the loss, then the training loop a
 
 A run writes runs/<name>/: metrics.json, log.jsonl, checkpoint.pt, panel.png and a mesh.ply.
 
+Sections: 1 config, 2 scene and rays, 3 octree, 4 fields, 5 from SDF to colour, 6 mask and GPL,
+7 model and objective, 8 baselines, 9 energy, 10 training, 11 scoring, 12 experiments, 13 commands.
+
 Conventions, stated once
   world     the foreground is the unit sphere; x_file = x * scale + center leads back to SfM units
   cameras   c2w (3,4) camera to world, OpenCV axes: x right, y down, z forward; pixel centres +0.5
@@ -737,7 +740,7 @@ def edge_indicator(e_grad: Tensor, e_curv: Tensor, lam_grad: float, lam_lap: flo
                    calibration: Tensor | None) -> Tensor:
     """Phi (R,) from the rays' eikonal error and curvature. Eq. 4 calibration (2,): centre and width
     of the sigmoid. None is the literal reading: Phi then lies between 0.5 and 1 for every ray, a
-    price that tells no edges. Detached [D3]: it is to hold back the mask, not to smooth geometry."""
+    price that tells no edge. Detached [D3]: it is to hold back the mask, not to smooth geometry."""
     x = (lam_grad * e_grad + lam_lap * e_curv).detach()  # (R,)
     return torch.sigmoid(x if calibration is None else (x - calibration[0]) / calibration[1])
 
@@ -1390,8 +1393,8 @@ def save_checkpoint(path: Path, cfg: Config, model, optimizer, gen, state: dict)
 def read_checkpoint(path: Path) -> dict:
     """A checkpoint's dictionary: tensors and plain values, never code. Raises UserError."""
     if not path.exists():
-        raise UserError(f"{path} does not exist: train first, without --resume or --render, or name "
-                        "the run by the --data, --seed and --name that it was made with")
+        raise UserError(f"{path} does not exist: train first, without --resume or --render, or "
+                        "name the run by the --data, --seed and --name that it was made with")
     try:
         data_prep.refuse_bomb(path)
         saved = dict(torch.load(path, map_location="cpu", weights_only=True))
@@ -1987,12 +1990,13 @@ PIECES = {  # of the method, one changed at a time
     "no curvature": dict(lam_curv=0.0), "no Lipschitz": dict(lam_lps=0.0),
     "uniform sampling": dict(sampling="uniform"), "printed alpha": dict(alpha="printed"),
     "finite differences": dict(normals="fd"), "uniform grid": dict(grid="uniform"),
-    "half depth": dict(levels=-1), "double depth": dict(levels=1),  # more than the footprint's
+    "half depth": dict(levels=-1), "double depth": dict(levels=1),  # so many more levels
 }
 RIVALS = {method + how: dict(method=method, tuned=bool(how))
           for method in ("geonvsw", "nerfw", "hanerf") for how in ("", " tuned")}
 FRONT = {f"{rays} rays x {n} samples": dict(rays=rays, samples=n, bg_samples=n)
          for rays in (256, 512, 1024) for n in (8, 16, 24)}
+FRONT |= {f"512 x 16, {k}": PIECES[k] for k in ("half depth", "double depth")}
 CALM = dict(occluders=0.2, exposure=1.0, photos=24, pose_noise=0.0, amp="off")  # of a 64 px toy,
 STRESS = {  # and one knob turned at a time
     "occluders": (0.0, 0.2, 0.4, 0.6), "exposure": (0.0, 1.0, 2.0), "photos": (6, 24, 48),
@@ -2040,13 +2044,18 @@ def run_once(given: dict, run: Path) -> dict:
 
 
 def matrix(kind: str, rows: dict[str, dict], given: dict, seeds: int, workers: int = 1) -> dict:
-    """Metrics, a list over seeds, of every row (settings by name). workers: CPU processes that
-    train side by side, a thread each, which is faster than one after the other with all threads."""
-    if not find_scene(make_config(given))["is_test"].any():  # made once, before processes start
+    """Metrics, a list over seeds, of every row (settings by name, levels relative to the scene's).
+    workers: CPU processes that train side by side, a thread each, which is faster than one after
+    the other with all threads."""
+    cfg = make_config(given)
+    scene, folder = find_scene(cfg), Path("runs") / kind  # made once, before processes start
+    if not scene["is_test"].any():
         raise UserError("experiments need held-out photos: give a split file, see README")
-    folder = Path("runs") / kind
-    jobs = [(given | row | dict(seed=seed), folder / f"{name}-{seed}".replace(" ", "_"))
-            for name, row in rows.items() for seed in range(seeds)]
+    levels, jobs = cfg.levels or levels_for_footprint(float(scene["footprint"])), []
+    for (name, row), seed in itertools.product(rows.items(), range(seeds)):
+        deeper = {"levels": max(1, levels + row["levels"])} if "levels" in row else {}
+        jobs.append((given | row | deeper | dict(seed=seed),
+                     folder / f"{name}-{seed}".replace(" ", "_")))
     for job, _ in jobs:  # a row that cannot work is refused before the first is run
         check(make_config({k: v for k, v in job.items() if k != "toy"}))
     if workers == 1:
@@ -2178,10 +2187,7 @@ def chart(kind: str, groups: dict[str, list[dict]]) -> None:
 def ablation(given: dict, seeds: int, workers: int) -> None:
     """What each piece buys, the octree's depth and shape among them: ablation.csv and png."""
     plt, cfg = plotting(), make_config(given)
-    levels = cfg.levels or levels_for_footprint(float(find_scene(cfg)["footprint"]))
-    rows = {name: row | ({"levels": levels + row["levels"]} if "levels" in row else {})
-            for name, row in PIECES.items()}
-    groups = matrix(f"ablation-{scene_name(cfg)}", rows, given, seeds, workers)
+    groups = matrix(f"ablation-{scene_name(cfg)}", PIECES, given, seeds, workers)
     table = [table_line(dict(row=name), metrics) for name, metrics in groups.items()]
     write_table(Path("ablation.csv"), table)
     shown = dict(psnr="PSNR, dB", sdf_error="SDF error, radii", mask_iou="mask IoU",
@@ -2286,18 +2292,19 @@ def find_scene(cfg: Config) -> dict:
     file is newer. Raises UserError."""
     path, is_toy = scene_file(cfg), not cfg.data and cfg.scene == "toy"
     scene = data_prep.read_scene(path) if path.exists() else None
-    tables = Path(cfg.data).glob("*.tsv") if cfg.data and scene else ()
-    is_old = any(table.stat().st_mtime > path.stat().st_mtime for table in tables)
-    if scene and not is_old and (
-            is_toy or json.loads(str(scene["info"]))["downscale"] == cfg.downscale):
+    info = json.loads(str(scene["info"])) if scene else {}
+    split = info.get("split")  # named by data_prep.py --split
+    tables = [Path(split)] if split else Path(cfg.data).glob("*.tsv") if cfg.data and scene else ()
+    is_old = any(t.exists() and t.stat().st_mtime > path.stat().st_mtime for t in tables)
+    if scene and not is_old and (is_toy or info["downscale"] == cfg.downscale):
         return scene
     print(f"making {path}")
     if cfg.data:
-        scene = data_prep.prepare(cfg.data, cfg.downscale)
+        scene = data_prep.prepare(cfg.data, cfg.downscale, split)
     elif is_toy:
         scene = data_prep.make_toy()
     else:
-        scene = data_prep.locate_and_prepare(cfg.scene, "data", cfg.downscale)
+        scene = data_prep.locate_and_prepare(cfg.scene, "data", cfg.downscale, split)
     data_prep.write_scene(path, scene)
     return scene
 

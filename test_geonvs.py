@@ -4473,12 +4473,12 @@ def test_processes_side_by_side_give_the_runs_of_one(tmp_path, monkeypatch, arra
 def test_ablation_fills_its_table_with_depths_around_the_footprints(tmp_path, monkeypatch, arrays, brief):
     monkeypatch.chdir(tmp_path)
     data_prep.write_scene(tmp_path / "data" / "toy.npz", arrays)
-    monkeypatch.setattr(g, "PIECES", {k: g.PIECES[k] for k in ("full", "no mask", "double depth")})
-    g.ablation(TINY | dict(steps=2, levels=2), 1, 1)
+    monkeypatch.setattr(g, "PIECES", {k: g.PIECES[k] for k in ("full", "half depth", "double depth")})
+    g.ablation(TINY | dict(steps=2, levels=1), 1, 1)
     head, *rows = [line.split(",") for line in (tmp_path / "ablation.csv").read_text().splitlines()]
-    assert [row[0] for row in rows] == ["full", "no mask", "double depth"] and (tmp_path / "ablation.png").exists()
+    assert [row[0] for row in rows] == ["full", "half depth", "double depth"] and (tmp_path / "ablation.png").exists()
     levels = [g.read_metrics(p)["config"]["levels"] for p in sorted((tmp_path / "runs" / "ablation-toy").iterdir())]
-    assert sorted(levels) == [2, 2, 3]
+    assert levels == [2, 1, 1]  # double, full, half: not below one level
 
 
 # ---- 13 command line -----------------------------------------------------------------------------------
@@ -4588,6 +4588,22 @@ def test_a_checkpoint_of_another_version_is_refused_in_one_line(desk, capsys, sa
     torch.save(saved, desk / "runs" / "a" / "checkpoint.pt")
     assert command("--resume", "--name", "a") == 2
     assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_a_split_named_once_stays_when_the_scene_is_made_again(desk, folder):
+    """Otherwise photos held out so far would be trained on, without a word."""
+    names = sorted(p.name for p in (folder / "dense/images").iterdir())
+    table = desk / "mine.tsv"
+    table.write_text("filename\tid\tsplit\n" + "".join(
+        f"{n}\t{i}\t{'test' if i == 2 else 'train'}\n" for i, n in enumerate(names)))
+    sys_argv = [str(folder), "--split", "mine.tsv", "--downscale", "1"]
+    data_prep.main(sys_argv)
+    for downscale in (1, 2):
+        scene = g.find_scene(config(data=str(folder), downscale=downscale))
+        assert scene["name"][scene["is_test"]].tolist() == [names[2]]
+    table.unlink()
+    with pytest.raises(g.UserError, match="mine.tsv is not there"):
+        g.find_scene(config(data=str(folder), downscale=4))
 
 
 def test_two_folders_of_one_name_are_two_scenes(desk, monkeypatch, arrays):
