@@ -1493,10 +1493,12 @@ def test_the_pinned_row_is_zero_and_gets_no_gradient():
     assert (octree.features.grad[1:] != 0).any()
 
 
-def test_interpolate_passes_gradcheck():
+@pytest.mark.parametrize("sets", [1, 3])  # the value alone takes a way of its own
+@pytest.mark.parametrize("kind", [torch.int32, torch.int64])
+def test_interpolate_passes_gradcheck(sets, kind):
     features = random(12, 2, low=-1).requires_grad_()
-    corner = 1 + (random(5, 8, seed=1) * 11).long()
-    w = random(5, 3, 8, seed=2, low=-1)
+    corner = 1 + (random(5, 8, seed=1) * 11).to(kind)
+    w = random(5, sets, 8, seed=2, low=-1)
     assert torch.autograd.gradcheck(lambda f: g.Interpolate.apply(f, corner, w), (features,))
 
 
