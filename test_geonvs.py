@@ -1508,6 +1508,15 @@ def test_interpolate_equals_a_naive_sum_also_when_corners_repeat():
     close(g.Interpolate.apply(features, corner, w), torch.einsum("pjk,pkc->pjc", w, features[corner]))
 
 
+@pytest.mark.parametrize("sets", [1, 3])
+def test_interpolate_sends_back_what_a_naive_sum_does(sets):
+    """gradcheck pulls with one-hot vectors alone; here with both signs."""
+    features, w = random(9, 2, low=-1).requires_grad_(), random(5, sets, 8, seed=2, low=-1)
+    corner, pull = 1 + (random(5, 8, seed=1) * 8).int(), random(5, sets, 2, seed=3, low=-1)
+    values = torch.einsum("pjk,pkc->pjc", w, features[corner.long()]), g.Interpolate.apply(features, corner, w)
+    close(*(torch.autograd.grad(value, features, pull)[0] for value in values))
+
+
 def test_memory_of_a_shell_grows_fourfold_per_level_not_eightfold():
     octree = g.Octree(1.0, 4, 1)
     sizes = [octree.bytes()]
