@@ -31,10 +31,10 @@ Where the printed paper is departed from, the line carries its tag:
   [D4]  the curvature loss is |lap| times eps: |lap| of a trilinear field grows as eps shrinks
   [D5]  the Lipschitz term is a sum of logs, not a product that can drown the colour at first
   [D6]  CGNet: GroupNorm for BatchNorm, half the width, negative first bias, head at half resolution
-  [D7]  the mask pays mean M, not mean M^2, to go with an L1 error, above the error of good rays
+  [D7]  the mask pays mean M, not mean M^2, to go with an L1 error, above what SfM pixels err by
   [D8]  the background starts where the ray leaves the sphere and its last section is opaque
   [D9]  the SDF branch stays in float32 under mixed precision: half precision makes noise of normals
-  [D10] SfM points place the sphere, seed the octree and pull |s(p)| to zero
+  [D10] SfM points place the sphere, seed the octree, pull |s(p)| to zero and are never transient
   [D11] samples are drawn from a cached SDF volume; no second network pass along the ray
   [D12] test photos: appearance fitted on the left half, scored on the right half
   [D13] exact normals by the trilinear weights, curvature where a ray ends; --normals fd: as printed
@@ -127,7 +127,7 @@ class Config:
     lam_lps: float = opt(1e-5, "weight of the Lipschitz loss, log form [D5] [R]")
     lam_off: float = opt(1e-3, "weight of the off-surface loss [R]")
     lam_sfm: float = opt(0.3, "weight of |s(p)| at SfM points [D10]")
-    lam_mask: float = opt(0.08, "weight of mean M: the excess error that masks a pixel [D7]")
+    lam_mask: float = opt(0.04, "weight of mean M: the excess error that masks a pixel [D7]")
     lam_bimodal: float = opt(1e-4, "weight of the pull of M to 0 and 1 (Ha-NeRF's digit loss) [R]")
     lr_grid: float = opt(1e-2, "learning rate of octree features")
     lr_net: float = opt(2e-3, "learning rate of networks and codes")
@@ -167,6 +167,16 @@ class Scene(NamedTuple):
     def photos(self, is_test: bool) -> Tensor:
         """Numbers (B,) of the held-out photos, or of those to train on."""
         return torch.nonzero(self.is_test == is_test)[:, 0]
+
+    def sightings(self) -> tuple[Tensor, Tensor, Tensor]:
+        """SfM points that photos show: photo (T,), point (T,3), its place on it (T,2) in 0..1."""
+        img, x = (torch.as_tensor(self.raw[f"track_{k}"]) for k in ("photo", "point"))  # (T,)
+        img, x = img.long().to(self.c2w.device), self.points[x.long()]  # (T,), (T,3)
+        local = ((x - self.c2w[img, :, 3])[:, None] @ self.c2w[img, :, :3])[:, 0]  # (T,3) camera
+        uv = local[:, :2] / local[:, 2:] * self.K[img, :2] + self.K[img, 2:]  # (T,2) px
+        uv = uv / self.wh[img]  # (T,2)
+        ok = (local[:, 2] > 0) & ((uv >= 0) & (uv < 1)).all(1)  # not those that SfM got wrong
+        return img[ok], x[ok], uv[ok]
 
 
 def load_scene(source: dict | Path, device="cpu", mask_px: int = 96) -> Scene:
@@ -851,13 +861,18 @@ class GeoNVS(Method):
         self.deviation, self.cgnet = Deviation(), CGNet()
         I, m = len(scene.wh), (cfg.mask_px + 1) // 2
         n = np.clip(octree.resolution(levels - 1), 64, 128)
+        static = torch.zeros(I, 1, m, m, dtype=torch.bool, device=dev)
+        img, _, uv = scene.sightings()  # (T,), (T,2)
+        static[img, 0, *(uv * m).long().flip(1).T] = True
         memory = dict(
             bg_color=sky.float().nan_to_num(0.5), calibration=torch.tensor([0.0, 1.0]),
             level=torch.tensor(0.1),  # running lower quartile of the L1 error
             cache=torch.zeros(1, 1, n, n, n),  # SDF on a dense grid, for placing samples [D11]
             hits=torch.full((max(2 ** 18, 512 * cfg.rays), 5), 2.0),  # ends of rays, errors, pixels
             logits=torch.full((I, 1, m, m), -9.0),  # last output of the mask network
-            seen=torch.full((I, 4, m, m), -1.0))  # last residual and Phi by pixel; -1: no ray yet
+            seen=torch.full((I, 4, m, m), -1.0),  # last residual and Phi by pixel; -1: no ray yet
+            static=static,  # pixels that show an SfM point, so nobody stands there [D10]
+            usual=torch.tensor(0.3))  # running upper quartile of the errors of such pixels
         for name, value in memory.items():
             self.register_buffer(name, value)
         self.to(dev)
@@ -959,7 +974,8 @@ class GeoNVS(Method):
         sigmoid hardly moves at 0 or 1, price times M is minimised through its logistic surrogate:
         the same sign, so the same optimum, but a slope that never vanishes. Errors are signed means
         over 3x3 pixels, of the worst channel: what a blurred model lacks cancels, people do not.
-        The price falls with the level of usual errors: at first all pixels are wrong."""
+        Pixels that show SfM points are scene: what they err by is excused, and tells how large an
+        error is usual. The price lies above that: at first, and in fine detail, all is wrong."""
         cfg, logits = self.cfg, self.cgnet(self.scene.thumbs[pick].float() / 255)  # (B,1,h,w)
         self.logits[pick] = logits.detach()
         residual, edge = self.seen[pick].split((3, 1), 1)  # (B,3,h,w), (B,1,h,w)
@@ -967,7 +983,10 @@ class GeoNVS(Method):
         around = F.avg_pool2d(torch.cat([residual * known, known], 1), 3, 1, 1)  # (B,4,h,w)
         mean = around[:, :3] / around[:, 3:].clamp(min=0.1)  # (B,3,h,w)
         error = mean.abs().amax(1, keepdim=True)  # (B,1,h,w)
-        price = cfg.lam_mask + 3 * self.level + cfg.lam_gpl * edge - error  # (B,1,h,w) [D7]
+        static = self.static[pick]  # (B,1,h,w)
+        usual = torch.where(static & (edge >= 0), error, math.nan).nanquantile(0.75)
+        self.usual.lerp_(torch.where(usual.isnan(), self.usual, usual), 0.1)
+        price = cfg.lam_mask + self.usual + cfg.lam_gpl * edge - error * ~static  # [D7]
         slope = F.softplus(torch.where(price > 0, logits, -logits))  # (B,1,h,w)
         pull = cfg.lam_bimodal * bimodality(logits.sigmoid())
         return (price.abs() * slope * known).mean() + pull
@@ -1036,9 +1055,8 @@ class GeoNVS(Method):
     @torch.no_grad()
     def health(self) -> dict[str, Tensor]:
         """Mean foreground opacity of rays from training photos to SfM points that they show."""
-        raw, scene, dev = self.scene.raw, self.scene, self.cache.device
-        img, x = (torch.as_tensor(raw[f"track_{k}"]).long().to(dev) for k in ("photo", "point"))
-        x = scene.points[x]  # (N,3), seen in photos img (N,)
+        scene = self.scene
+        img, x, _ = scene.sightings()  # (T,), (T,3)
         pick = torch.nonzero(~scene.is_test[img] & (x.norm(dim=1) < 0.95))[:, 0]
         if not len(pick):
             return {}
