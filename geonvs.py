@@ -22,7 +22,7 @@ Conventions, stated once
   sdf       positive outside; the normal is the unit gradient; colours are sRGB in [0, 1]
   mask      M = 1 means transient (person, car), M = 0 means scene
   shapes    R rays, S samples per ray, P points, L octree levels, C channels per level,
-            V octree corners, A appearance dims, I photos, K sparse points
+            V octree corners, A appearance dims, I photos, K sparse points, T sightings of them
 
 Where the printed paper is departed from, the line carries its tag:
   [D1]  alpha is divided by sigmoid(zeta s_prev) and never negative (printed: a wall is 63 % opaque)
@@ -34,7 +34,7 @@ Where the printed paper is departed from, the line carries its tag:
   [D7]  the mask pays mean M, not mean M^2, to go with an L1 error, above what SfM pixels err by
   [D8]  the background starts where the ray leaves the sphere and its last section is opaque
   [D9]  the SDF branch stays in float32 under mixed precision: half precision makes noise of normals
-  [D10] SfM points place the sphere, seed the octree, pull |s(p)| to zero and are never transient
+  [D10] SfM points place the sphere, seed the octree, pull |s(p)| to zero and teach M = 0
   [D11] samples are drawn from a cached SDF volume; no second network pass along the ray
   [D12] test photos: appearance fitted on the left half, scored on the right half
   [D13] exact normals by the trilinear weights, curvature where a ray ends; --normals fd: as printed
@@ -862,16 +862,20 @@ class GeoNVS(Method):
         I, m = len(scene.wh), (cfg.mask_px + 1) // 2
         n = np.clip(octree.resolution(levels - 1), 64, 128)
         static = torch.zeros(I, 1, m, m, dtype=torch.bool, device=dev)
-        img, _, uv = scene.sightings()  # (T,), (T,2)
-        static[img, 0, *(uv * m).long().flip(1).T] = True
+        img, x, uv = scene.sightings()  # (T,), (T,3), (T,2)
+        col, row = (uv * m).long().unbind(1)  # (T,)
+        static[img, 0, row, col] = True
+        pick = torch.nonzero(~scene.is_test[img] & (x.norm(dim=1) < 0.95))[:, 0]
+        pick = pick[::max(1, len(pick) // 256)]
+        self.probes = img[pick], x[pick]  # (Q,), (Q,3) for health
         memory = dict(
             bg_color=sky.float().nan_to_num(0.5), calibration=torch.tensor([0.0, 1.0]),
-            level=torch.tensor(0.1),  # running lower quartile of the L1 error
+            level=torch.tensor(0.1),  # running lower quartile of all L1 errors, for splits
             cache=torch.zeros(1, 1, n, n, n),  # SDF on a dense grid, for placing samples [D11]
             hits=torch.full((max(2 ** 18, 512 * cfg.rays), 5), 2.0),  # ends of rays, errors, pixels
             logits=torch.full((I, 1, m, m), -9.0),  # last output of the mask network
             seen=torch.full((I, 4, m, m), -1.0),  # last residual and Phi by pixel; -1: no ray yet
-            static=static,  # pixels that show an SfM point, so nobody stands there [D10]
+            static=static,  # pixels that show an SfM point, but for outlines scene [D10]
             usual=torch.tensor(0.3))  # running upper quartile of the errors of such pixels
         for name, value in memory.items():
             self.register_buffer(name, value)
@@ -974,8 +978,8 @@ class GeoNVS(Method):
         sigmoid hardly moves at 0 or 1, price times M is minimised through its logistic surrogate:
         the same sign, so the same optimum, but a slope that never vanishes. Errors are signed means
         over 3x3 pixels, of the worst channel: what a blurred model lacks cancels, people do not.
-        Pixels that show SfM points are scene: what they err by is excused, and tells how large an
-        error is usual. The price lies above that: at first, and in fine detail, all is wrong."""
+        Pixels that show SfM points are scene: their own error never counts for M = 1, but tells
+        what is usual. The price lies above: at first, and in fine detail, the scene is wrong."""
         cfg, logits = self.cfg, self.cgnet(self.scene.thumbs[pick].float() / 255)  # (B,1,h,w)
         self.logits[pick] = logits.detach()
         residual, edge = self.seen[pick].split((3, 1), 1)  # (B,3,h,w), (B,1,h,w)
@@ -1055,14 +1059,11 @@ class GeoNVS(Method):
     @torch.no_grad()
     def health(self) -> dict[str, Tensor]:
         """Mean foreground opacity of rays from training photos to SfM points that they show."""
-        scene = self.scene
-        img, x, _ = scene.sightings()  # (T,), (T,3)
-        pick = torch.nonzero(~scene.is_test[img] & (x.norm(dim=1) < 0.95))[:, 0]
-        if not len(pick):
+        scene, (img, x) = self.scene, self.probes
+        if not len(img):
             return {}
-        pick = pick[::max(1, len(pick) // 256)]  # (R,)
-        img, o = img[pick], scene.c2w[img[pick], :, 3]  # (R,), (R,3)
-        d = F.normalize(x[pick] - o, dim=1)  # (R,3)
+        o = scene.c2w[img, :, 3]  # (Q,3)
+        d = F.normalize(x - o, dim=1)  # (Q,3)
         rays = Rays(o, d, scene.near[img], img, o[:, :2], o)
         return dict(sfm_opacity=self.render(rays, self.appearance(img))["opacity"].mean())
 
