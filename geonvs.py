@@ -42,21 +42,8 @@ Where the printed paper is departed from, the line carries its tag:
 """
 from __future__ import annotations
 
-import argparse
-import contextlib
-import csv
-import difflib
-import functools
-import itertools
-import json
-import math
-import os
-import shutil
-import signal
-import subprocess
-import sys
-import threading
-import time
+import argparse, contextlib, csv, difflib, functools, io, itertools, json, math, os, shutil
+import signal, subprocess, sys, threading, time
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, field, fields
 from multiprocessing import get_context, parent_process
@@ -77,7 +64,6 @@ from data_prep import UserError, atomic_write
 
 
 # ---- 1 Config: every field is a flag -------------------------------------------------------------
-
 
 def opt(default, text, *choices):
     return field(default=default, metadata={"help": text, "choices": choices or None})
@@ -132,7 +118,6 @@ class Config:
     lr_grid: float = opt(1e-2, "learning rate of octree features")
     lr_net: float = opt(2e-3, "learning rate of networks and codes")
     lr_zeta: float = opt(1e-3, "learning rate of the deviation network")
-    lr_mask: float = opt(8e-3, "learning rate of the mask network, which learns in few steps [D14]")
     curve: bool = opt(False, "record PSNR of held-out left halves over s and Wh, for --chart")
     amp: str = opt("auto", "mixed precision; auto: on a GPU [D9]", "auto", "on", "off")
     protocol: str = opt("half", "leaky: codes fitted on whole photos [D12]", "half", "leaky")
@@ -147,7 +132,6 @@ PRESETS = {"fast": dict(rays=0.5, steps=0.5), "default": {}, "best": dict(steps=
 
 
 # ---- 2 Scene file and rays -----------------------------------------------------------------------
-
 
 class Scene(NamedTuple):
     """The arrays of a scene file (data_prep.py documents them) as tensors on the device."""
@@ -287,23 +271,17 @@ def in_shares(f, *rows) -> dict[str, Tensor]:
 # ---- 3 Octree: features on the corners of cells --------------------------------------------------
 
 CORNERS = torch.cartesian_prod(*[torch.arange(2)] * 3)  # (8,3), x slowest
+# (8,32): the monomials 1 z y yz x xz xy xyz of a position in a cell times this are the weights of
+# the 8 corners, then their derivatives along x, y, z. Per axis the ends weigh 1 - f and f.
+VALUE, SLOPE = torch.tensor([[[1.0, 0], [-1, 1]], [[-1, 1], [0, 0]]])  # (2,2) each, rows 1, f
+TRILINEAR = torch.cat([torch.kron(x, torch.kron(y, z)) for x, y, z in (
+    3 * [VALUE], (SLOPE, VALUE, VALUE), (VALUE, SLOPE, VALUE), (VALUE, VALUE, SLOPE))], 1)
 
 
 @functools.cache
 def resident(constant: Tensor, device: torch.device) -> Tensor:
     """A constant on a device, copied once: a copy in every step would make a GPU wait."""
     return constant.to(device)
-
-
-def trilinear_matrices() -> Tensor:
-    """(8,32): the monomials 1 z y yz x xz xy xyz of a position in a cell times this are the weights
-    of the 8 corners, then their derivatives along x, y, z. Per axis the ends weigh 1 - f and f."""
-    value, slope = torch.tensor([[[1.0, 0], [-1, 1]], [[-1, 1], [0, 0]]])  # (2,2) each, rows 1, f
-    axes = [[slope if i == j else value for i in range(3)] for j in (None, 0, 1, 2)]
-    return torch.cat([torch.kron(x, torch.kron(y, z)) for x, y, z in axes], 1)
-
-
-TRILINEAR = trilinear_matrices()
 
 
 class Interpolate(torch.autograd.Function):
@@ -901,7 +879,7 @@ class GeoNVS(Method):
         cfg, grids = self.cfg, [o.features for o in self.octrees()]
         others = [dict(params=grids, lr=cfg.lr_grid),
                   dict(params=[self.deviation.v], lr=cfg.lr_zeta),
-                  dict(params=list(self.cgnet.parameters()), lr=cfg.lr_mask)]
+                  dict(params=list(self.cgnet.parameters()), lr=8e-3)]  # learns in few steps [D14]
         taken = {id(p) for group in others for p in group["params"]}
         nets = [p for p in self.parameters() if id(p) not in taken]
         return [dict(params=nets, lr=cfg.lr_net), *others]
@@ -1018,20 +996,17 @@ class GeoNVS(Method):
         it, where corners become pinned, is nearer to the surface than HIDDEN / zeta: if |grad s| is
         1, no pixel changes by more than 2 sigmoid(-HIDDEN) = 0.005. Adam's moments move along."""
         octree, keys, zeta = self.sdf.octree, list(self.sdf.octree.split_keys), self.deviation()
-        hits = self.hits[self.hits[:, 0] < 2]  # (P,5) without the slots that no ray has filled
+        hits = self.hits[self.hits[:, :3].norm(dim=1) < 1]  # (P,5) no empty slots, no missing rays
         split_bytes = 8 * (36 + 4 * octree.features.shape[1])  # nodes, and as many corners
         room = int(max(0, self.cfg.max_mb * 2 ** 20 - octree.bytes()) // split_bytes)
-        for level in range(octree.levels - 1):
-            if not len(octree.cells[level]):
-                break
+        for level in range(min(octree.active, octree.levels - 1)):
             s = torch.cat([self.sdf(x)[0] for x in octree.centres(level).split(CHUNK)])  # (N,)
             reach = (math.sqrt(3) / 2 + 1) * octree.cell(level)
             key = octree.key(octree.cells[level], level)  # (N,)
             keys[level] = keys[level][torch.isin(keys[level], key[s.abs() < reach + HIDDEN / zeta])]
             bound = self.cfg.split_error * self.level
             new = octree.key(worth_splitting(octree, level, hits, bound), level)
-            new = new[torch.isin(new, key[s.abs() < reach]) & ~torch.isin(new, keys[level])]
-            new = new[:room]
+            new = new[torch.isin(new, key[s.abs() < reach]) & ~torch.isin(new, keys[level])][:room]
             room -= len(new)
             keys[level] = torch.cat([keys[level], new])
         keys = [k.to(hits.device) for k in agreed([k.cpu() for k in keys])]
@@ -1063,19 +1038,16 @@ class GeoNVS(Method):
         if not len(img):
             return {}
         o = scene.c2w[img, :, 3]  # (Q,3)
-        d = F.normalize(x - o, dim=1)  # (Q,3)
-        rays = Rays(o, d, scene.near[img], img, o[:, :2], o)
+        rays = Rays(o, F.normalize(x - o, dim=1), scene.near[img], img, o[:, :2], o)
         return dict(sfm_opacity=self.render(rays, self.appearance(img))["opacity"].mean())
 
     def render(self, rays: Rays, code: Tensor) -> dict[str, Tensor]:
         """render_rays without jitter, for pictures and for fitting codes."""
-        shape = len(rays.o), self.cfg.samples + self.cfg.bg_samples
-        jitter = rays.o.new_full(shape, 0.5)  # (R,S+B)
-        return render_rays(self, rays, code, jitter)
+        shape = len(rays.o), self.cfg.samples + self.cfg.bg_samples  # R, S+B
+        return render_rays(self, rays, code, rays.o.new_full(shape, 0.5))
 
 
 # ---- 8 The paper's two baselines, under the same loop, protocol and meter ------------------------
-
 
 def positional(x: Tensor, octaves: int) -> Tensor:
     """x (...,n) with sines and cosines of 2^k x: (...,n(1+2 octaves)) (NeRF Eq. 4, no pi)."""
@@ -1261,7 +1233,6 @@ class HaNeRF(NeRFW):
 
 # ---- 9 Energy meter ------------------------------------------------------------------------------
 
-
 class EnergyMeter:
     """Joules between start() and stop(), by an energy counter and by integrated power samples.
     counter() returns joules; power() watts, integrated by the trapezoid rule every `period`
@@ -1269,20 +1240,19 @@ class EnergyMeter:
     and a resumed run goes on counting."""
     def __init__(self, source=None, counter=None, power=None, period=0.5, clock=time.monotonic):
         self.source, self.counter, self.power = source, counter, power
-        self.period, self.clock, self.lock = period, clock, threading.Lock()
+        self.period, self.clock = period, clock
         self.joules, self.sampled_joules = 0.0 if counter else None, 0.0 if power else None
         self.idle_w = power() if power else None  # read before any work
         self.last = None  # clock, counter and power at the last tick
 
     def tick(self) -> None:
         """Adds what was spent since the last tick."""
-        with self.lock:
-            now = self.clock(), self.counter and self.counter(), self.power and self.power()
-            if self.last and self.joules is not None:
-                self.joules += now[1] - self.last[1]
-            if self.last and self.sampled_joules is not None:
-                self.sampled_joules += (now[2] + self.last[2]) / 2 * (now[0] - self.last[0])
-            self.last = now
+        now = self.clock(), self.counter and self.counter(), self.power and self.power()
+        if self.last and self.joules is not None:
+            self.joules += now[1] - self.last[1]
+        if self.last and self.sampled_joules is not None:
+            self.sampled_joules += (now[2] + self.last[2]) / 2 * (now[0] - self.last[0])
+        self.last = now
 
     def start(self) -> None:
         self.last, self.stopped = None, threading.Event()
@@ -1477,15 +1447,13 @@ def training_step(model: Method, optimizer, photos: Tensor, state: dict, progres
     optimizer.zero_grad()
     (scale * loss).backward()
     set_learning_rate(optimizer, state["step"], progress)
-    parameters = [p for group in optimizer.param_groups for p in group["params"]]
-    grads = [p.grad for p in parameters if p.grad is not None]
+    grads = [p.grad for p in model.parameters() if p.grad is not None]
     if RANKS > 1:  # their mean over the processes
         flat = nn.utils.parameters_to_vector(grads)
         dist.all_reduce(flat)
         nn.utils.vector_to_parameters(flat.div_(RANKS), grads)
-    norm = nn.utils.get_total_norm(grads)
     optimizer.grad_scale = None if scale == 1 else torch.full((), scale, device=device)
-    optimizer.found_inf = (~torch.isfinite(norm + loss.detach())).float()
+    optimizer.found_inf = (~torch.isfinite(nn.utils.get_total_norm(grads) + loss.detach())).float()
     optimizer.step()
     model.maintain(state["step"], progress, optimizer)
     state["step"] += 1
@@ -1502,8 +1470,7 @@ def train(cfg: Config, scene: Scene, run: Path, saved: dict | None = None):
     gen = torch.Generator(device).manual_seed(cfg.seed)
     model = METHODS[cfg.method][0](cfg, scene)
     optimizer, meter = make_optimizer(model), make_meter(device)
-    state = dict(step=0, seconds=0.0, joules=None, sampled_joules=None, dropped=0, curve=[],
-                 codes=None)
+    state = dict(step=0, seconds=0.0, dropped=0, curve=[], codes=None)
     checkpoint, log_path = run / "checkpoint.pt", run / "log.jsonl"
     if device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(device)
@@ -1513,7 +1480,7 @@ def train(cfg: Config, scene: Scene, run: Path, saved: dict | None = None):
         meter.joules = state["joules"] if meter.counter else None  # all of it was measured, or None
         meter.sampled_joules = state["sampled_joules"] if meter.power else None
     elif not RANK:  # nothing of a former run may be taken for this one's
-        for name in ("checkpoint.pt", "metrics.json"):
+        for name in ("checkpoint.pt", "metrics.json", "panel.png", "mesh.ply"):
             (run / name).unlink(missing_ok=True)
     lines = log_path.read_text().splitlines(True) if saved and log_path.exists() else []
     write_text(log_path, "".join(k for k in lines if k.endswith("\n")
@@ -1683,13 +1650,12 @@ def fit_codes(model, scene: Scene, photos: Tensor, codes: Tensor | None, steps: 
         return codes
     sides = (True, False) if protocol == "leaky" else (True,)
     allowed = [torch.cat([half_pixels(scene, i, side) for side in sides]) for i in photos.tolist()]
-    img = photos.repeat_interleave(n)  # (R,)
     adam = torch.optim.Adam([codes], lr=0.1)
     trainable = [p for p in model.parameters() if p.requires_grad]
     model.requires_grad_(False)
     for step in range(steps):
         adam.param_groups[0]["lr"] = 0.1 * 0.1 ** (step / steps)
-        rays = make_rays(scene, img, pixels_of_each(allowed, n, gen))
+        rays = make_rays(scene, photos.repeat_interleave(n), pixels_of_each(allowed, n, gen))
         rgb = model.render(rays, codes.repeat_interleave(n, 0))["rgb"]  # (R,3)
         adam.zero_grad()
         (rgb - rays.rgb).abs().mean().backward()
@@ -1801,8 +1767,7 @@ def toy_truth(model, scene: Scene) -> dict:
         x = x + 0.02 * torch.randn(x.shape, generator=gen).to(dev)  # (P,3) around the true surface
         x = x[x.norm(dim=1) < 1]
         x_file = x.cpu().numpy() * raw["scale"] + raw["center"]
-        true = data_prep.toy_sdf(x_file, scene.info["background"]) / raw["scale"]
-        true = torch.as_tensor(true)  # (P,)
+        true = torch.as_tensor(data_prep.toy_sdf(x_file, scene.info["background"]) / raw["scale"])
         s = torch.cat([model.sdf(part)[0] for part in x.split(CHUNK)]).cpu()  # (P,)
         found["sdf_error"] = (s - true)[true.abs() < 0.05].abs().mean().item()
     if model.use_mask:
@@ -2080,8 +2045,7 @@ def matrix(kind: str, rows: dict[str, dict], given: dict, seeds: int, workers: i
     if workers == 1:
         done = [run_once(*job) for job in jobs]
     else:
-        spawn = get_context("spawn")
-        with ProcessPoolExecutor(workers, spawn, torch.set_num_threads, (1,)) as pool:
+        with ProcessPoolExecutor(workers, get_context("spawn"), torch.set_num_threads, [1]) as pool:
             done = list(pool.map(run_once, *zip(*jobs)))
     return {name: done[i * seeds:(i + 1) * seeds] for i, name in enumerate(rows)}
 
@@ -2102,14 +2066,10 @@ def table_line(name: dict, metrics: list[dict]) -> dict:
 
 def write_table(path: Path, rows: list[dict]) -> None:
     """CSV of rows with the same keys; None stays empty."""
-    def cell(v):
-        return f"{v:.5g}" if isinstance(v, float) else v
-
-    def write(tmp):
-        with open(tmp, "w", newline="") as file:
-            lines = [list(rows[0])] + [[cell(v) for v in row.values()] for row in rows]
-            csv.writer(file, lineterminator="\n").writerows(lines)
-    atomic_write(path, write)
+    text = io.StringIO()
+    cells = [[f"{v:.5g}" if isinstance(v, float) else v for v in row.values()] for row in rows]
+    csv.writer(text, lineterminator="\n").writerows([list(rows[0]), *cells])
+    write_text(path, text.getvalue())
     print(f"wrote {path}")
 
 
@@ -2159,23 +2119,24 @@ def plot_curves(axis, groups: dict[str, list[dict]], unit: str, xlabel: str) -> 
         axis.plot(*zip(*pareto(points)), "o", mfc="none", mec="black", ms=9, label="Pareto front")
         floor, _ = summary([m for metrics in groups.values() for m in metrics], "psnr_floor")
         axis.axhline(floor, color="grey", lw=1, label="trivial predictor")
-        axis.set_xscale("log")
-        ticks = [m * 10.0 ** k for k in range(-4, 7) for m in (1, 2, 5)]
-        ticks = [t for t in ticks if axis.get_xlim()[0] < t < axis.get_xlim()[1]]
-        axis.set_xticks(ticks, [f"{t:g}" for t in ticks])
-        axis.minorticks_off()
+        axis.set_xscale("log", subs=(2, 5))
+        axis.xaxis.set_major_formatter("{x:g}")
+        axis.xaxis.set_minor_formatter("{x:g}")
         axis.legend(fontsize=8, ncol=3, loc="upper left", bbox_to_anchor=(0, -0.13))
     else:
         axis.text(0.5, 0.5, f"no {unit} in these runs\n(needs --curve\nand a counter)",
                   ha="center", va="center", transform=axis.transAxes)
     axis.set(xlabel=xlabel, ylabel="PSNR on held-out left halves, dB")
-    axis.grid(alpha=0.3)
+    axis.grid(alpha=0.3, which="both")
 
 
 def chart(kind: str, groups: dict[str, list[dict]]) -> None:
     """<kind>.png: PSNR over seconds and watt-hours, a curve a row; <kind>.csv: the table, with time
     and energy to PSNR levels, and to where each baseline's better row ends, over what that took."""
     plt, rows, goals, spent = plotting(), [], {f"{n}dB": float(n) for n in range(14, 32)}, {}
+    finished = [m for metrics in groups.values() for m in metrics if "failed" not in m]
+    if not finished:
+        raise UserError("all of these runs failed: the log.txt of each says why")
     for rival in ("nerfw", "hanerf"):
         ends = [[m["curve"][-1] for m in metrics] for name, metrics in groups.items()
                 if name.startswith(rival) and all(m["curve"] for m in metrics)]
@@ -2192,13 +2153,12 @@ def chart(kind: str, groups: dict[str, list[dict]]) -> None:
                 theirs = spent[unit, goal]
                 row[f"{unit}_ratio_{goal}"] = mean / theirs if mean and theirs else None
         rows.append(row)
-    has_energy = any(p["wh"] for metrics in groups.values() for m in metrics for p in m["curve"])
+    has_energy = any(p["wh"] for m in finished for p in m["curve"])
     figure, axes = plt.subplots(1, 2, figsize=(12, 4.5), sharey=True,
                                 width_ratios=(1, 1 if has_energy else 0.3))
     plot_curves(axes[0], groups, "seconds", "training time, s")
     plot_curves(axes[1], groups, "wh", "energy, Wh")
-    some = next(m for metrics in groups.values() for m in metrics if "failed" not in m)
-    figure.suptitle(f"{some['scene']}: speed against accuracy ({some['device']})")
+    figure.suptitle("{scene}: speed against accuracy ({device})".format(**finished[0]))
     save_figure(figure, Path(f"{kind}.png"))
     write_table(Path(f"{kind}.csv"), rows)
 
@@ -2256,20 +2216,17 @@ def stress(given: dict, seeds: int, workers: int) -> None:
 
 # ---- 13 Command line -----------------------------------------------------------------------------
 
+def make_parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0], allow_abbrev=False,
+                                     argument_default=argparse.SUPPRESS)
 
-class Parser(argparse.ArgumentParser):
-    """Bad flags end with one sentence that names the nearest right one."""
-    def error(self, message):
+    def error(message):  # bad flags end with one sentence that names the nearest right one
         for word in message.split():
-            near = difflib.get_close_matches(word.split("=")[0], self._option_string_actions, 1)
+            near = difflib.get_close_matches(word.split("=")[0], parser._option_string_actions, 1)
             if word.startswith("--") and near and "unrecognized" in message:
                 message += f"; did you mean {near[0]}?"
         raise UserError(f"{message} (python geonvs.py --help lists all flags)")
-
-
-def make_parser() -> argparse.ArgumentParser:
-    parser = Parser(description=__doc__.split("\n\n")[0], allow_abbrev=False,
-                    argument_default=argparse.SUPPRESS)
+    parser.error = error
     for f in fields(Config):
         more = dict(type=type(f.default), choices=f.metadata["choices"])
         if f.type == "bool":
@@ -2363,16 +2320,6 @@ def execute(cfg: Config, arrays, run: Path, saved: dict | None = None) -> dict:
     return metrics
 
 
-def render_film(kind: str, run: Path, given: dict) -> None:
-    """Loads a finished run and films it."""
-    saved = read_checkpoint(run / "checkpoint.pt")
-    cfg = Config(**saved["config"] | given)
-    scene = load_scene(find_scene(cfg), pick_device(cfg.device), cfg.mask_px)
-    model = METHODS[cfg.method][0](cfg, scene)
-    restore(saved, run / "checkpoint.pt", model, None, None)
-    film(model, scene, kind, run / f"{kind}.mp4")
-
-
 def make_config(given: dict) -> Config:
     """Config's defaults, the scene's settings, the method's, the preset's factors, then flags."""
     chosen = {} if given.get("data") else dict(SCENES.get(given.get("scene", "toy"), {}))
@@ -2389,17 +2336,17 @@ def main(argv: list[str] | None = None) -> None:
     commands = {k: given.pop(k) for k in set(given) - {f.name for f in fields(Config)}}
     cfg, seeds, saved = make_config(given), commands.get("seeds", 3), None
     run = Path("runs") / (cfg.name or f"{scene_name(cfg)}-{cfg.method}-{cfg.seed}")
-    if "resume" in commands:
+    if {"resume", "render"} & set(commands):
         if {"preset", "tuned"} & set(given):
-            raise UserError("--preset and --tuned are for new runs: --resume keeps its settings")
+            raise UserError("--preset and --tuned are for new runs: a saved one keeps its settings")
         saved = read_checkpoint(run / "checkpoint.pt")
         cfg = Config(**saved["config"] | given)
     check(cfg)
     if seeds < 1 or RANKS > 1 and {"chart", "front", "ablation", "stress"} & set(commands):
         raise UserError("experiments need --seeds of at least 1 and one process, not torchrun")
     device = pick_device(cfg.device)
-    workers = 1 if device.type == "cuda" else os.cpu_count()
-    timed = dict(minutes=2.0, curve=True) | given  # one at a time, all threads
+    workers = 1 if device.type == "cuda" else torch.get_num_threads()
+    timed = dict(minutes=0.0 if "steps" in given else 2.0, curve=True) | given  # all threads
     if device.type == "cuda":
         torch.cuda.set_device(device)
     if RANKS > 1:
@@ -2420,7 +2367,10 @@ def main(argv: list[str] | None = None) -> None:
     elif "stress" in commands:
         stress(given, seeds, workers)
     elif "render" in commands:
-        render_film(commands["render"], run, given)
+        scene = load_scene(find_scene(cfg), device, cfg.mask_px)
+        model = METHODS[cfg.method][0](cfg, scene)
+        restore(saved, run / "checkpoint.pt", model, None, None)
+        film(model, scene, commands["render"], run / f"{commands['render']}.mp4")
     else:
         try:
             arrays = RANK or find_scene(cfg)
@@ -2436,7 +2386,7 @@ def run_command_line(entry) -> None:
     except UserError as error:
         message = str(error)
     except torch.OutOfMemoryError:
-        message = "the GPU's memory is full: lower --rays, --samples or --max_mb"
+        message = "the GPU's memory is full: lower --samples or --max_mb, or --rays in a new run"
     except OSError as error:  # a full disk, a folder without permission
         message = f"{error}: free or choose a place, then go on with --resume"
     except KeyboardInterrupt:  # outside the training loop, which ends its step and saves

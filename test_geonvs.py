@@ -2903,7 +2903,8 @@ def test_background_off_shows_one_colour(scene):
 
 
 def test_a_scene_without_points_works(scene):
-    bare = scene._replace(points=scene.points[:0])
+    none = np.zeros(0, np.int32)
+    bare = scene._replace(points=scene.points[:0], raw=scene.raw | dict(track_photo=none, track_point=none))
     model = new_model(bare)
     total, raw = model.losses(*batch(bare), generator())
     total.backward()
