@@ -2982,6 +2982,24 @@ def hit_the_ball(model, n, error, direction=(0.3, -0.5, 0.8), pixel=0.0):
     return at
 
 
+@pytest.mark.parametrize("radius, is_split", [(0.9, True), (1.1, False)])
+def test_rays_that_miss_the_sphere_split_no_cell(radius, is_split):
+    """Their closest points lie in the cube all the same, where ground goes on beyond the sphere."""
+    class Ground(Ball):
+        def __call__(self, x):
+            return x.norm(dim=1) - radius, x.new_zeros(len(x), g.GEO)
+    model = refinable()
+    model.sdf, octree = Ground(), model.sdf.octree
+    model.sdf.octree = octree
+    at = radius * F.normalize(torch.tensor([[0.71, 0.70, 0.01]]), dim=1)
+    model.hits[:] = torch.cat([at, torch.tensor([[0.5, 0.0]])], 1)
+    depth = []
+    for _ in range(2):
+        depth.append(sum(torch.isin(octree.key(octree.cell_of(at, k), k), octree.split_keys[k]).item() for k in range(3)))
+        g.GeoNVS.refine(model, model.optimizer)
+    assert (depth[1] > depth[0]) == is_split
+
+
 def distance_to_cells(octree, level, keys):
     cells = octree.cells[level][torch.isin(octree.key(octree.cells[level], level), keys)]
     return Ball()((cells + 0.5) * octree.cell(level) - 1)[0].abs()
@@ -4477,6 +4495,25 @@ def finished(folder, **metrics):
                 config=dataclasses.asdict(g.make_config(dict(steps=1))))
     (folder / "metrics.json").write_text(json.dumps(base | metrics))
     return str(folder)
+
+
+def test_a_chart_of_nothing_but_failures_is_refused(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a" / "metrics.json").write_text(json.dumps(
+        dict(failed="diverged", method="geonvsw", curve=[], config=dict(tuned=False))))
+    with pytest.raises(g.UserError, match="all of these runs failed"):
+        g.main(["--chart", "a"])
+    assert [p.name for p in tmp_path.iterdir()] == ["a"]
+
+
+@pytest.mark.parametrize("flags, minutes", [([], 2.0), (["--steps", "7"], 0.0), (["--minutes", "1"], 1.0)])
+def test_a_chart_runs_for_two_minutes_or_as_long_as_it_is_told(monkeypatch, flags, minutes):
+    given = []
+    monkeypatch.setattr(g, "matrix", lambda kind, rows, settings, seeds: given.append(settings))
+    monkeypatch.setattr(g, "chart", lambda *a: None)
+    g.main(["--chart", *flags])
+    assert given[0]["minutes"] == minutes and given[0]["curve"]
 
 
 def test_chart_of_finished_runs_writes_picture_and_table(tmp_path, monkeypatch):
