@@ -2500,6 +2500,7 @@ def test_one_photo_and_the_smallest_batch_train(arrays):
     n = int(arrays["start"][1])
     one = {k: arrays[k][:1] for k in ("wh", "K", "c2w", "near", "name")}
     one |= dict(rgb=arrays["rgb"][:n], start=arrays["start"][:2], is_test=np.zeros(1, bool))
+    one |= {k: arrays[k][arrays["track_photo"] == 0] for k in ("track_photo", "track_point")}
     scene = g.load_scene(arrays | one, "cpu", 32)
     model = new_model(scene, photos=1, rays=2)
     rays, pick = model.batch(scene.photos(False), generator())
