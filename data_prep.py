@@ -508,7 +508,7 @@ def read_colmap(sparse):
         safe_name(name, sparse / "images.bin")
         need(np.isfinite(pose).all() and any(pose[:4]) and camera in cameras and name not in photos,
              f"{sparse}: photo {name} has no finite pose, no camera, or occurs twice; export again")
-        w, *v = np.array(pose[:4]) / np.linalg.norm(pose[:4])   # old files are not normalised
+        w, *v = np.array(pose[:4]) / math.hypot(*pose[:4])   # old files are not normalised
         cross = np.cross(v, np.eye(3))                       # c2w = 1 - 2 w [v] + 2 [v] [v]
         R = np.eye(3) + 2 * w * cross + 2 * cross @ cross
         seen = np.frombuffer(take(f"{24 * count(24)}s")[0], [("uv", "<f8", 2), ("id", "<u8")])
