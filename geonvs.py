@@ -1460,10 +1460,9 @@ def training_step(model: Method, optimizer, photos: Tensor, state: dict, progres
     return logs, optimizer.found_inf.long()
 
 
-def train(cfg: Config, scene: Scene, run: Path, saved: dict | None = None):
-    """Trains until cfg.steps or cfg.minutes; writes log.jsonl and checkpoint.pt below run. saved: a
-    checkpoint to go on from. Returns model, state (step, seconds, joules, curve), meter. Evaluation
-    moments are outside the timed and metered window."""
+def prepare(cfg: Config, scene: Scene, run: Path, saved: dict | None):
+    """What training begins with, new or from a checkpoint: model, optimiser, meter, generator and
+    state. The run's folder keeps nothing of a former run, of the log what the checkpoint knows."""
     device = scene.c2w.device
     torch.set_flush_denormal(True)  # vanishing weights would otherwise slow a CPU down
     torch.manual_seed(cfg.seed)
@@ -1471,20 +1470,29 @@ def train(cfg: Config, scene: Scene, run: Path, saved: dict | None = None):
     model = METHODS[cfg.method][0](cfg, scene)
     optimizer, meter = make_optimizer(model), make_meter(device)
     state = dict(step=0, seconds=0.0, dropped=0, curve=[], codes=None)
-    checkpoint, log_path = run / "checkpoint.pt", run / "log.jsonl"
     if device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(device)
     if saved is not None:
-        state |= restore(saved, checkpoint, model, optimizer, gen)
+        state |= restore(saved, run / "checkpoint.pt", model, optimizer, gen)
         state |= dict(joules=0.0, sampled_joules=0.0) if RANK else {}  # what all spent counts once
         meter.joules = state["joules"] if meter.counter else None  # all of it was measured, or None
         meter.sampled_joules = state["sampled_joules"] if meter.power else None
     elif not RANK:  # nothing of a former run may be taken for this one's
         for name in ("checkpoint.pt", "metrics.json", "panel.png", "mesh.ply"):
             (run / name).unlink(missing_ok=True)
-    lines = log_path.read_text().splitlines(True) if saved and log_path.exists() else []
-    write_text(log_path, "".join(k for k in lines if k.endswith("\n")
-                                 and json.loads(k)["step"] <= state["step"]))
+    log = run / "log.jsonl"
+    lines = log.read_text().splitlines(True) if saved and log.exists() else []
+    write_text(log, "".join(k for k in lines if k.endswith("\n")
+                            and json.loads(k)["step"] <= state["step"]))
+    return model, optimizer, meter, gen, state
+
+
+def train(cfg: Config, scene: Scene, run: Path, saved: dict | None = None):
+    """Trains until cfg.steps or cfg.minutes; writes log.jsonl and checkpoint.pt below run. saved: a
+    checkpoint to go on from. Returns model, state (step, seconds, joules, curve), meter. Evaluation
+    moments are outside the timed and metered window."""
+    model, optimizer, meter, gen, state = prepare(cfg, scene, run, saved)
+    device, checkpoint, log_path = scene.c2w.device, run / "checkpoint.pt", run / "log.jsonl"
     photos, held_out = scene.photos(False), scene.photos(True)  # (B,)
     dropped = torch.tensor(state["dropped"], device=device)
     streak, warned = torch.zeros_like(dropped), set()  # void steps in a row; warnings given
