@@ -60,7 +60,7 @@ from skimage.metrics import structural_similarity
 from torch import Tensor, nn
 
 import data_prep
-from data_prep import UserError, atomic_write
+from data_prep import UserError, atomic_write, need
 
 
 # ---- 1 Config: every field is a flag -------------------------------------------------------------
@@ -163,9 +163,8 @@ class Scene(NamedTuple):
         return img[ok], x[ok], uv[ok]
 
 
-def load_scene(source: dict | Path, device="cpu", mask_px: int = 96) -> Scene:
-    """Scene from a file of data_prep.py, or from such a file's dictionary. Raises UserError."""
-    raw = source if isinstance(source, dict) else data_prep.read_scene(source)
+def load_scene(raw: dict, device="cpu", mask_px: int = 96) -> Scene:
+    """Scene from the dictionary of a scene file (data_prep.read_scene, make_toy or prepare)."""
     photos = [raw["rgb"][a:b].reshape(h, w, 3)
               for a, b, (w, h) in zip(raw["start"], raw["start"][1:], raw["wh"])]
     thumbs = [cv2.resize(p, (mask_px, mask_px), interpolation=cv2.INTER_AREA) for p in photos]
@@ -429,14 +428,13 @@ class Octree(nn.Module):
 def seed_octree(octree: Octree, points: Tensor, dense: int, shell: tuple[float, float]) -> None:
     """Splits all cells that touch the shell of radii up to level `dense`, then cells near points:
     one cell on every side, so that the corners around a point are never hanging."""
-    for level in range(octree.levels - 1):
-        if level < dense:
-            reach = octree.cell(level) * math.sqrt(3) / 2
-            r = octree.centres(level).norm(dim=1)  # (N,)
-            touches = (r > shell[0] - reach) & (r < shell[1] + reach)  # (N,)
-            octree.split(level, octree.cells[level][touches])
-        elif len(points) and level == dense:
-            octree.split(level, octree.around(octree.cell_of(points, level), level))
+    for level in range(min(dense, octree.levels - 1)):
+        reach = octree.cell(level) * math.sqrt(3) / 2
+        r = octree.centres(level).norm(dim=1)  # (N,)
+        touches = (r > shell[0] - reach) & (r < shell[1] + reach)  # (N,)
+        octree.split(level, octree.cells[level][touches])
+    if len(points) and dense < octree.levels - 1:
+        octree.split(dense, octree.around(octree.cell_of(points, dense), dense))
     octree.features.data[1:].normal_(0, octree.std)
 
 
@@ -558,7 +556,6 @@ class Background(nn.Module):
 
 # ---- 5 From SDF to colour: sections along the ray, alpha, compositing ----------------------------
 
-
 class Deviation(nn.Module):
     """The deviation network: zeta = exp(10 v), one learned number; 1/zeta is a surface's width."""
     def __init__(self, zeta: float = 20.0):
@@ -671,7 +668,6 @@ def render_rays(model: "GeoNVS", rays: Rays, code: Tensor, jitter: Tensor) -> di
 
 # ---- 6 Photos in the wild: transient mask and geometry preservation ------------------------------
 
-
 def conv(cin: int, cout: int, size: int = 3, stride: int = 1) -> nn.Sequential:
     return nn.Sequential(nn.Conv2d(cin, cout, size, stride, size // 2, bias=False),
                          nn.GroupNorm(8, cout), nn.PReLU(cout))  # [D6]
@@ -750,7 +746,6 @@ def gpl_loss(mask: Tensor, edge: Tensor) -> Tensor:
 
 # ---- 7 The model and its objective ---------------------------------------------------------------
 
-
 def bimodality(mask: Tensor) -> Tensor:
     """The second half of L_reg: a pole at 1/2 that pushes M to 0 or 1 (Ha-NeRF's digit loss)."""
     return (1 / ((mask - 0.5) ** 2 + 0.02)).mean()
@@ -769,7 +764,7 @@ class Method(nn.Module):
     adam = dict(betas=(0.9, 0.99), eps=1e-15)  # as is usual for feature grids (Instant-NGP)
 
     def octrees(self) -> list[Octree]:
-        return []
+        return [part for part in self.modules() if isinstance(part, Octree)]
 
     def codes(self) -> Tensor:
         """Appearance codes (I,A) of all photos."""
@@ -790,6 +785,11 @@ class Method(nn.Module):
         return {}
 
 
+REFINE_AT = (0.1, 0.2, 0.3, 0.45, 0.6)  # shares of training at which the octree is refined
+SPLIT_RAYS = 6  # recent rays that end in a cell before it is split
+HIDDEN = 6.0  # zeta |s| from where on the field is not seen: sigmoid(-6) = 0.0025
+
+
 def worth_splitting(octree: Octree, level: int, hits: Tensor, bound: float) -> Tensor:
     """Cells (Q,3) where enough rays end, that miss their colour by more than bound on average, and
     to whose pixels the children are not too fine; worst first. hits: (P,5), the rays' ends, errors
@@ -801,11 +801,6 @@ def worth_splitting(octree: Octree, level: int, hits: Tensor, bound: float) -> T
     pays = (count >= SPLIT_RAYS) & (error > bound) & (pixel < octree.cell(level) / 2)  # (Q,)
     worst = error.argsort(descending=True)
     return at[worst[pays[worst]]]
-
-
-REFINE_AT = (0.1, 0.2, 0.3, 0.45, 0.6)  # shares of training at which the octree is refined
-SPLIT_RAYS = 6  # recent rays that end in a cell before it is split
-HIDDEN = 6.0  # zeta |s| from where on the field is not seen: sigmoid(-6) = 0.0025
 
 
 class GeoNVS(Method):
@@ -870,9 +865,6 @@ class GeoNVS(Method):
     def set_extra_state(self, state: dict) -> None:
         self.refined = state["refined"]
         self.use_mask = state["use_mask"] if self.cfg.mask == "auto" else self.use_mask
-
-    def octrees(self) -> list[Octree]:
-        return [part.octree for part in (self.sdf, self.background) if part is not None]
 
     def groups(self) -> list[dict]:
         """Optimiser groups: features fast, networks and codes slower, zeta and mask apart."""
@@ -968,7 +960,7 @@ class GeoNVS(Method):
         static = self.static[pick]  # (B,1,h,w)
         usual = torch.where(static & (edge >= 0), error, math.nan).nanquantile(0.75)
         self.usual.lerp_(torch.where(usual.isnan(), self.usual, usual), 0.1)
-        price = cfg.lam_mask + self.usual + cfg.lam_gpl * edge - error * ~static  # [D7]
+        price = cfg.lam_mask + self.usual + cfg.lam_gpl * edge - error * ~static  # (B,1,h,w) [D7]
         slope = F.softplus(torch.where(price > 0, logits, -logits))  # (B,1,h,w)
         pull = cfg.lam_bimodal * bimodality(logits.sigmoid())
         return (price.abs() * slope * known).mean() + pull
@@ -1246,8 +1238,13 @@ class EnergyMeter:
         self.last = None  # clock, counter and power at the last tick
 
     def tick(self) -> None:
-        """Adds what was spent since the last tick."""
-        now = self.clock(), self.counter and self.counter(), self.power and self.power()
+        """Adds what was spent since the last tick. A failed reading ends metering, not the run."""
+        try:
+            now = self.clock(), self.counter and self.counter(), self.power and self.power()
+        except Exception as error:  # drivers raise what they like
+            print(f"  energy is null, as it could not be read any more ({error})")
+            self.counter = self.power = self.joules = self.sampled_joules = self.source = None
+            return
         if self.last and self.joules is not None:
             self.joules += now[1] - self.last[1]
         if self.last and self.sampled_joules is not None:
@@ -1349,10 +1346,8 @@ class Diverged(UserError):
 
 
 def make_optimizer(model: Method) -> torch.optim.Adam:
-    optimizer = torch.optim.Adam(model.groups(), **model.adam, fused=True)
-    for group in optimizer.param_groups:
-        group["base_lr"] = group["lr"]
-    return optimizer
+    groups = [group | dict(base_lr=group["lr"]) for group in model.groups()]
+    return torch.optim.Adam(groups, **model.adam, fused=True)
 
 
 def set_learning_rate(optimizer, step: int, progress: float) -> None:
@@ -1381,24 +1376,21 @@ def save_checkpoint(path: Path, cfg: Config, model, optimizer, gen, state: dict)
 
 def read_checkpoint(path: Path) -> dict:
     """A checkpoint's dictionary: tensors and plain values, never code. Raises UserError."""
-    if not path.exists():
-        raise UserError(f"{path} does not exist: train first, without --resume or --render, or "
-                        "name the run by the --data, --seed and --name that it was made with")
+    need(path.exists(), f"{path} does not exist: train first, without --resume or --render, or "
+         "name the run by the --data, --seed and --name that it was made with")
     try:
         data_prep.refuse_bomb(path)
         saved = dict(torch.load(path, map_location="cpu", weights_only=True))
         config, step = saved["config"], saved["state"]["step"]
         kinds = {f.name: (float, int) if f.type == "float" else type(f.default)
                  for f in fields(Config)}
-        is_ours = (saved["geonvs"] == 1 and config.keys() == kinds.keys()
-                   and all(isinstance(config[name], kind) for name, kind in kinds.items())
-                   and isinstance(step, int) and step >= 0)
+        need(saved["geonvs"] == 1 and config.keys() == kinds.keys()
+             and all(isinstance(config[name], kind) for name, kind in kinds.items())
+             and isinstance(step, int) and step >= 0, "")
+        return saved
     except Exception as error:  # a damaged file can fail in any layer: zip, pickle, tensor storage
-        raise UserError(f"{path} is damaged or not a checkpoint ({type(error).__name__}): "
-                        "delete it and train again") from None
-    if not is_ours:
-        raise UserError(f"{path} is not a checkpoint of this program: delete it and train again")
-    return saved
+        raise UserError(f"{path} is damaged or not a checkpoint of this program "
+                        f"({type(error).__name__}): delete it and train again") from None
 
 
 def restore(saved: dict, path: Path, model, optimizer, gen: torch.Generator) -> dict:
@@ -1421,8 +1413,8 @@ def restore(saved: dict, path: Path, model, optimizer, gen: torch.Generator) -> 
         return saved["state"]
     except (KeyError, IndexError, ValueError, RuntimeError, TypeError, AttributeError) as error:
         raise UserError(f"{path} does not fit this scene and these settings "
-                        f"({str(error).splitlines()[0][:90]}): delete it or use the flags it was "
-                        "made with") from None
+                        f"({str(error).splitlines()[0][:90]}): delete it or use the flags and "
+                        "the kind of device it was made with") from None
 
 
 LOSS_SCALE = 2.0 ** 10  # lifts small gradients above what float16 can hold
@@ -1552,8 +1544,7 @@ def train(cfg: Config, scene: Scene, run: Path, saved: dict | None = None):
         raise Diverged(f"the last {int(streak)} steps had no finite loss or gradient; {checkpoint} "
                        "holds the last good weights. Likely causes: learning rates too high (try a "
                        "third of --lr_grid and --lr_net), half precision (--amp off), broken poses")
-    if is_stopped:
-        raise UserError(f"stopped at step {state['step']}; add --resume to go on")
+    need(not is_stopped, f"stopped at step {state['step']}; add --resume to go on")
     state["seconds"] = spent
     return model, state, meter
 
@@ -1575,7 +1566,6 @@ def report(cfg, log_path, step, seconds, progress, logs, dropped, warned: set) -
 
 # ---- 11 Scoring, mesh, pictures ------------------------------------------------------------------
 
-
 def psnr(a: np.ndarray, b: np.ndarray) -> float:
     """Peak signal-to-noise ratio in dB of two uint8 pictures."""
     mse = ((a.astype(np.float64) - b) ** 2).mean()
@@ -1590,44 +1580,37 @@ def ssim(a: np.ndarray, b: np.ndarray) -> float | None:
                                        sigma=1.5, use_sample_covariance=False))
 
 
-class LPIPS(nn.Module):
-    """Learned perceptual distance on AlexNet features, v0.1 weights (Zhang et al. 2018)."""
+LPIPS_WEIGHTS = (  # of AlexNet; of the heads, v0.1
+    "https://download.pytorch.org/models/alexnet-owt-7be5be79.pth",
+    "https://raw.githubusercontent.com/richzhang/PerceptualSimilarity/master/"
+    "lpips/weights/v0.1/alex.pth")
 
-    TRUNK = "https://download.pytorch.org/models/alexnet-owt-7be5be79.pth"
-    HEADS = ("https://raw.githubusercontent.com/richzhang/PerceptualSimilarity/master/"
-             "lpips/weights/v0.1/alex.pth")
 
-    def __init__(self):
-        super().__init__()
-        sizes = ((3, 64, 11, 4, 2), (64, 192, 5, 1, 2), (192, 384, 3, 1, 1), (384, 256, 3, 1, 1),
-                 (256, 256, 3, 1, 1))
-        self.convs = nn.ModuleList(nn.Conv2d(*size) for size in sizes)
-        self.heads = nn.ParameterList(torch.zeros(1, size[1], 1, 1) for size in sizes)
-
-    def load(self, trunk: dict, heads: dict) -> "LPIPS":
-        for i, (layer, at) in enumerate(zip(self.convs, (0, 3, 6, 8, 10))):
-            layer.load_state_dict({k: trunk[f"features.{at}.{k}"] for k in ("weight", "bias")})
-            self.heads[i].data.copy_(heads[f"lin{i}.model.1.weight"])
-        return self
+def lpips_from(trunk: dict, heads: dict):
+    """Learned perceptual distance (Zhang et al. 2018) from weights of AlexNet and of its heads: a
+    function of pictures (B,3,H,W) in 0..1 and others, with the distances (B,)."""
+    shapes = (0, 4, 2), (3, 1, 2), (6, 1, 1), (8, 1, 1), (10, 1, 1)  # place, stride, padding
+    layers = [(trunk[f"features.{at}.weight"], trunk[f"features.{at}.bias"], stride, padding,
+               heads[f"lin{i}.model.1.weight"]) for i, (at, stride, padding) in enumerate(shapes)]
 
     @torch.no_grad()
-    def forward(self, a: Tensor, b: Tensor) -> Tensor:
-        """Distance (B,) of pictures (B,3,H,W) in 0..1."""
+    def distance(a: Tensor, b: Tensor) -> Tensor:
         mean, std = a.new_tensor([[-0.030, -0.088, -0.188], [0.458, 0.448, 0.450]])[..., None, None]
         x, total = (torch.cat([a, b]) * 2 - 1 - mean) / std, 0
-        for i, (layer, head) in enumerate(zip(self.convs, self.heads)):
-            x = F.relu(layer(F.max_pool2d(x, 3, 2) if i in (1, 2) else x))
+        for i, (weight, bias, stride, padding, head) in enumerate(layers):
+            x = F.max_pool2d(x, 3, 2) if i in (1, 2) else x
+            x = F.relu(F.conv2d(x, weight, bias, stride, padding))
             fa, fb = F.normalize(x, dim=1, eps=1e-10).chunk(2)
             total = total + ((fa - fb) ** 2 * head).sum(1).mean((1, 2))
         return total
+    return distance
 
 
-def make_lpips(device) -> LPIPS | None:
+def make_lpips(device):
     """LPIPS with its published weights, or None with one line of reason where they can't be had."""
     try:
-        weights = [torch.hub.load_state_dict_from_url(url, map_location="cpu", progress=False,
-                   weights_only=True) for url in (LPIPS.TRUNK, LPIPS.HEADS)]
-        return LPIPS().load(*weights).to(device)
+        return lpips_from(*(torch.hub.load_state_dict_from_url(
+            url, map_location=device, progress=False, weights_only=True) for url in LPIPS_WEIGHTS))
     except Exception as error:  # no network, or a damaged file: any layer can fail
         print(f"  lpips is null: its weights could not be downloaded or read ({error})")
         return None
@@ -1640,10 +1623,12 @@ def half_pixels(scene: Scene, photo: int, left: bool) -> Tensor:
     return pixel[(pixel % w < w // 2) == left]
 
 
-def pixels_of_each(allowed: list[Tensor], n: int, gen: torch.Generator) -> Tensor:
-    """n random pixel numbers from each photo's allowed ones, photo by photo: (Bn,)."""
-    dev = gen.device
-    return torch.cat([a[torch.randint(len(a), (n,), generator=gen, device=dev)] for a in allowed])
+def color_errors(model, scene: Scene, photos: Tensor, codes: Tensor, allowed: list[Tensor], n: int,
+                 gen: torch.Generator) -> Tensor:
+    """Rendered less true colours (Bn,3) at n random ones of each photo's allowed pixels."""
+    pixel = [a[torch.randint(len(a), (n,), generator=gen, device=gen.device)] for a in allowed]
+    rays = make_rays(scene, photos.repeat_interleave(n), torch.cat(pixel))
+    return model.render(rays, codes.repeat_interleave(n, 0))["rgb"] - rays.rgb
 
 
 def fit_codes(model, scene: Scene, photos: Tensor, codes: Tensor | None, steps: int, protocol: str,
@@ -1659,17 +1644,14 @@ def fit_codes(model, scene: Scene, photos: Tensor, codes: Tensor | None, steps: 
     sides = (True, False) if protocol == "leaky" else (True,)
     allowed = [torch.cat([half_pixels(scene, i, side) for side in sides]) for i in photos.tolist()]
     adam = torch.optim.Adam([codes], lr=0.1)
-    trainable = [p for p in model.parameters() if p.requires_grad]
     model.requires_grad_(False)
     for step in range(steps):
         adam.param_groups[0]["lr"] = 0.1 * 0.1 ** (step / steps)
-        rays = make_rays(scene, photos.repeat_interleave(n), pixels_of_each(allowed, n, gen))
-        rgb = model.render(rays, codes.repeat_interleave(n, 0))["rgb"]  # (R,3)
+        loss = color_errors(model, scene, photos, codes, allowed, n, gen).abs().mean()
         adam.zero_grad()
-        (rgb - rays.rgb).abs().mean().backward()
+        loss.backward()
         adam.step()
-    for parameter in trainable:
-        parameter.requires_grad_(True)
+    model.requires_grad_(True)
     return codes.detach()
 
 
@@ -1677,12 +1659,11 @@ def validate(model, scene: Scene, photos: Tensor, codes: Tensor | None) -> tuple
     """Codes fitted a little further and PSNR, both on left halves of photos (B,): leaks nothing."""
     codes = fit_codes(model, scene, photos, codes, 20, "half", 32)
     gen = torch.Generator(scene.c2w.device).manual_seed(1)
-    pixel = pixels_of_each([half_pixels(scene, i, True) for i in photos.tolist()], 256, gen)
-    rays = make_rays(scene, photos.repeat_interleave(256), pixel)
+    left = [half_pixels(scene, i, True) for i in photos.tolist()]
     with torch.no_grad():
-        rgb = model.render(rays, codes.repeat_interleave(256, 0))["rgb"]  # (256B,3)
-    errors = ((rgb - rays.rgb) ** 2).reshape(len(photos), -1).mean(1)  # (B,)
-    return codes, (-10 * torch.log10(errors)).mean().item()
+        errors = color_errors(model, scene, photos, codes, left, 256, gen) ** 2  # (256B,3)
+    mse = errors.reshape(len(photos), -1).mean(1).clamp(min=1e-10)  # (B,)
+    return codes, (-10 * torch.log10(mse)).mean().item()
 
 
 RAY_BYTES = 2 ** 20  # memory that a ray takes in rendering: NeRF-W at full size needs 0.6 MiB
@@ -1710,16 +1691,12 @@ def to_uint8(picture: np.ndarray) -> np.ndarray:
     return (picture.clip(0, 1) * 255 + 0.5).astype(np.uint8)
 
 
-def floor_picture(truth: np.ndarray) -> np.ndarray:
-    """The trivial predictor: each row's mean colour of the left half, as (H,1,3) uint8."""
-    return to_uint8(truth[:, :truth.shape[1] // 2].mean(1, keepdims=True))
-
-
-def score(frame: dict[str, np.ndarray], lpips: LPIPS | None, device) -> dict:
+def score(frame: dict[str, np.ndarray], lpips, device) -> dict:
     """The right half of a rendered photo [D12] against the truth, beside two trivial predictors."""
     half = frame["rgb"].shape[1] // 2
     got, want = to_uint8(frame["rgb"])[:, half:], to_uint8(frame["truth"])[:, half:]
-    flat = np.broadcast_to(floor_picture(frame["truth"]), want.shape)
+    left = frame["truth"][:, :half]  # its mean colours, row by row, are the trivial predictor
+    flat = np.broadcast_to(to_uint8(left.mean(1, keepdims=True)), want.shape)
     mean = np.broadcast_to(flat.mean((0, 1)).round(), want.shape)
     row = dict(psnr=psnr(got, want), psnr_floor=psnr(flat, want), psnr_mean_color=psnr(mean, want),
                ssim=ssim(got, want), lpips=None)
@@ -1735,7 +1712,7 @@ def summary(rows: list[dict], key: str) -> tuple[float | None, float | None]:
     return (float(np.mean(values)), float(np.std(values))) if values else (None, None)
 
 
-def evaluate(model, scene: Scene, cfg: Config, lpips: LPIPS | None) -> dict:
+def evaluate(model, scene: Scene, cfg: Config, lpips) -> dict:
     """Scores of the test photos by the half-image protocol [D12], per photo and on average."""
     photos, rows, frames, seconds = scene.photos(True), [], [], []  # (B,)
     codes = fit_codes(model, scene, photos, None, 128, cfg.protocol) if len(photos) else []  # (B,A)
@@ -1792,7 +1769,7 @@ def extract_mesh(model: GeoNVS, resolution: int = 0) -> tuple[np.ndarray, np.nda
     colours (N,3), by marching cubes over `resolution` cells (default: two per finest octree cell,
     at most 512). Only corners are evaluated that are near the surface by the cached SDF."""
     scene, octree, cache = model.scene, model.sdf.octree, model.cache
-    n = resolution or min(2 * octree.resolution(octree.levels - 1), 512)
+    n = resolution or min(2 * octree.resolution(octree.active - 1), 512)
     line = torch.linspace(-1, 1, n + 1, device=cache.device)
     cached = F.interpolate(cache, size=(n + 1,) * 3, mode="trilinear", align_corners=True)[0, 0]
     is_inside = line[:, None, None] ** 2 + line[:, None] ** 2 + line ** 2 < 1  # (n+1,n+1,n+1)
@@ -1942,9 +1919,8 @@ def film(model, scene: Scene, kind: str, path: Path, count: int = 72) -> None:
     w, h = (scene.wh[view] // 2 * 2).tolist()
     if kind == "orbit":
         poses, codes = camera_path(c2w, count), codes.mean(0).expand(count, -1)
-    elif not codes.numel():
-        raise UserError("this run has no appearance codes: --render orbit shows what it has")
     else:
+        need(codes.numel(), "this run has no appearance codes: --render orbit shows what it has")
         u = torch.linspace(0, len(photos) - 1.001, count)[:, None].to(codes)
         i = u[:, 0].long()
         codes = torch.lerp(codes[i], codes[i + 1], u % 1)
@@ -2006,11 +1982,14 @@ FIGURES = ("psnr", "psnr_floor", "ssim", "sdf_error", "mask_iou", "mask_static",
 
 
 def read_metrics(run: Path) -> dict:
-    if not (run / "metrics.json").exists():
-        raise UserError(f"{run} holds no metrics.json: give folders of finished runs")
-    metrics = json.loads((run / "metrics.json").read_text())
-    if "failed" not in metrics and metrics["psnr"] is None:
-        raise UserError(f"{run} has no scores, as its scene holds no photos out: see README")
+    path = run / "metrics.json"
+    need(path.exists(), f"{run} holds no metrics.json: give folders of finished runs")
+    try:
+        metrics = json.loads(path.read_text())
+        has_score = "failed" in metrics or metrics["psnr"] is not None
+    except (ValueError, KeyError, TypeError):
+        raise UserError(f"{path} is damaged or not of this program: train that run again") from None
+    need(has_score, f"{run} has no scores, as its scene holds no photos out: see README")
     return metrics
 
 
@@ -2041,8 +2020,7 @@ def matrix(kind: str, rows: dict[str, dict], given: dict, seeds: int, workers: i
     the other with all threads."""
     cfg = make_config(given)
     scene, folder = find_scene(cfg), Path("runs") / kind  # made once, before processes start
-    if not scene["is_test"].any():
-        raise UserError("experiments need held-out photos: give a split file, see README")
+    need(scene["is_test"].any(), "experiments need held-out photos: give a split file, see README")
     levels, jobs = cfg.levels or levels_for_footprint(float(scene["footprint"])), []
     for (name, row), seed in itertools.product(rows.items(), range(seeds)):
         deeper = {"levels": max(1, levels + row["levels"])} if "levels" in row else {}
@@ -2058,27 +2036,15 @@ def matrix(kind: str, rows: dict[str, dict], given: dict, seeds: int, workers: i
     return {name: done[i * seeds:(i + 1) * seeds] for i, name in enumerate(rows)}
 
 
-def has_failed(metrics: dict) -> bool:
-    """Did a run diverge, or end below a picture of one colour?"""
-    return "failed" in metrics or metrics["psnr"] < metrics["psnr_mean_color"]
-
-
 def table_line(name: dict, metrics: list[dict]) -> dict:
-    """A line of a table: mean and spread over seeds. Failures count, in a column of their own."""
+    """A line of a table: mean and spread over seeds. Failures, runs that diverged or ended below a
+    picture of one colour, are counted in a column of their own."""
     cells = [m["octree_cells"] for m in metrics if m.get("octree_cells")]
-    line = name | dict(runs=len(metrics), failures=sum(map(has_failed, metrics)),
+    failures = sum("failed" in m or m["psnr"] < m["psnr_mean_color"] for m in metrics)
+    line = name | dict(runs=len(metrics), failures=failures,
                        cells=float(np.mean([sum(c) for c in cells])) if cells else None)
     pairs = ((key, summary(metrics, key)) for key in FIGURES)
     return line | {k: v for key, pair in pairs for k, v in zip((key, key + "_std"), pair)}
-
-
-def write_table(path: Path, rows: list[dict]) -> None:
-    """CSV of rows with the same keys; None stays empty."""
-    text = io.StringIO()
-    cells = [[f"{v:.5g}" if isinstance(v, float) else v for v in row.values()] for row in rows]
-    csv.writer(text, lineterminator="\n").writerows([list(rows[0]), *cells])
-    write_text(path, text.getvalue())
-    print(f"wrote {path}")
 
 
 def plotting():
@@ -2090,9 +2056,14 @@ def plotting():
     return plt
 
 
-def save_figure(figure, path: Path) -> None:
-    atomic_write(path, lambda tmp: figure.savefig(tmp, dpi=110, bbox_inches="tight"))
-    print(f"wrote {path}")
+def publish(kind: str, rows: list[dict], figure) -> None:
+    """<kind>.csv of rows with the same keys, where None stays empty, and <kind>.png."""
+    text = io.StringIO()
+    cells = [[f"{v:.5g}" if isinstance(v, float) else v for v in row.values()] for row in rows]
+    csv.writer(text, lineterminator="\n").writerows([list(rows[0]), *cells])
+    write_text(Path(f"{kind}.csv"), text.getvalue())
+    atomic_write(Path(f"{kind}.png"), lambda tmp: figure.savefig(tmp, dpi=110, bbox_inches="tight"))
+    print(f"wrote {kind}.csv and {kind}.png")
 
 
 def reached(curve: list[dict], level: float, unit: str) -> float | None:
@@ -2141,25 +2112,22 @@ def plot_curves(axis, groups: dict[str, list[dict]], unit: str, xlabel: str) -> 
 def chart(kind: str, groups: dict[str, list[dict]]) -> None:
     """<kind>.png: PSNR over seconds and watt-hours, a curve a row; <kind>.csv: the table, with time
     and energy to PSNR levels, and to where each baseline's better row ends, over what that took."""
-    plt, rows, goals, spent = plotting(), [], {f"{n}dB": float(n) for n in range(14, 32)}, {}
+    plt, rows, goals = plotting(), [], {f"{n}dB": dict(psnr=float(n)) for n in range(14, 32)}
     finished = [m for metrics in groups.values() for m in metrics if "failed" not in m]
-    if not finished:
-        raise UserError("all of these runs failed: the log.txt of each says why")
+    need(finished, "all of these runs failed: the log.txt of each says why")
     for rival in ("nerfw", "hanerf"):
         ends = [[m["curve"][-1] for m in metrics] for name, metrics in groups.items()
                 if name.startswith(rival) and all(m["curve"] for m in metrics)]
         if ends:
             best = max(ends, key=lambda points: summary(points, "psnr")[0])
-            goals[f"{rival}_end"] = summary(best, "psnr")[0]
-            spent |= {(unit, f"{rival}_end"): summary(best, unit)[0] for unit in ("seconds", "wh")}
+            goals[f"{rival}_end"] = {k: summary(best, k)[0] for k in ("psnr", "seconds", "wh")}
     for name, metrics in groups.items():
         row, curves = table_line(dict(row=name), metrics), [m["curve"] for m in metrics]
-        for unit, (goal, level) in itertools.product(("seconds", "wh"), goals.items()):
-            hits = [reached(curve, level, unit) for curve in curves]
-            row[f"{unit}_to_{goal}"] = mean = None if None in hits else float(np.mean(hits))
-            if (unit, goal) in spent:
-                theirs = spent[unit, goal]
-                row[f"{unit}_ratio_{goal}"] = mean / theirs if mean and theirs else None
+        for unit, (end, goal) in itertools.product(("seconds", "wh"), goals.items()):
+            hits = [reached(curve, goal["psnr"], unit) for curve in curves]
+            row[f"{unit}_to_{end}"] = mean = None if None in hits else float(np.mean(hits))
+            if unit in goal:
+                row[f"{unit}_ratio_{end}"] = mean / goal[unit] if mean and goal[unit] else None
         rows.append(row)
     has_energy = any(p["wh"] for m in finished for p in m["curve"])
     figure, axes = plt.subplots(1, 2, figsize=(12, 4.5), sharey=True,
@@ -2167,8 +2135,7 @@ def chart(kind: str, groups: dict[str, list[dict]]) -> None:
     plot_curves(axes[0], groups, "seconds", "training time, s")
     plot_curves(axes[1], groups, "wh", "energy, Wh")
     figure.suptitle("{scene}: speed against accuracy ({device})".format(**finished[0]))
-    save_figure(figure, Path(f"{kind}.png"))
-    write_table(Path(f"{kind}.csv"), rows)
+    publish(kind, rows, figure)
 
 
 def ablation(given: dict, seeds: int, workers: int) -> None:
@@ -2176,7 +2143,6 @@ def ablation(given: dict, seeds: int, workers: int) -> None:
     plt, cfg = plotting(), make_config(given)
     groups = matrix(f"ablation-{scene_name(cfg)}", PIECES, given, seeds, workers)
     table = [table_line(dict(row=name), metrics) for name, metrics in groups.items()]
-    write_table(Path("ablation.csv"), table)
     shown = dict(psnr="PSNR, dB", sdf_error="SDF error, radii", mask_iou="mask IoU",
                  octree_bytes="octree, bytes", rays_per_second="training, rays/s")
     figure, axes = plt.subplots(1, len(shown), figsize=(15, 0.33 * len(table) + 1), sharey=True)
@@ -2184,10 +2150,11 @@ def ablation(given: dict, seeds: int, workers: int) -> None:
         mean, std = (np.array([r[k] for r in table], float) for k in (key, key + "_std"))
         axis.barh([r["row"] for r in table], mean, xerr=std, color=COLORS[0])
         axis.axvline(mean[0], color="black", lw=1)
-        axis.set(xlabel=label, xlim=(np.nanmin(mean) - 1, None) if key == "psnr" else None)
+        has_low = key == "psnr" and np.isfinite(mean).any()
+        axis.set(xlabel=label, xlim=(np.nanmin(mean) - 1, None) if has_low else None)
     axes[0].invert_yaxis()
     figure.suptitle(f"{scene_name(cfg)}: one piece changed at a time, {seeds} seeds")
-    save_figure(figure, Path("ablation.png"))
+    publish("ablation", table, figure)
 
 
 def stress(given: dict, seeds: int, workers: int) -> None:
@@ -2202,7 +2169,6 @@ def stress(given: dict, seeds: int, workers: int) -> None:
     groups = matrix("stress", rows, given, seeds, workers)
     table = [table_line(dict(knob=knob, value=value, method=method), groups[name])
              for (knob, value, method), name in names.items()]
-    write_table(Path("stress.csv"), table)
     figure, axes = plt.subplots(2, len(STRESS), figsize=(16, 7), sharey="row")
     for pair, (knob, values) in zip(axes.T, STRESS.items()):
         for i, method in enumerate(STRESS_METHODS):
@@ -2219,7 +2185,7 @@ def stress(given: dict, seeds: int, workers: int) -> None:
     axes[1, 0].set_ylabel("SDF error, radii")
     figure.legend(*axes[0, 0].get_legend_handles_labels(), ncol=7, loc="lower center",
                   bbox_to_anchor=(0.5, -0.03))
-    save_figure(figure, Path("stress.png"))
+    publish("stress", table, figure)
 
 
 # ---- 13 Command line -----------------------------------------------------------------------------
@@ -2258,8 +2224,7 @@ def pick_device(name: str) -> torch.device:
     chosen = ("cuda" if count else "cpu") if name == "auto" else name
     if chosen == "cuda" or chosen in names[1:] and RANKS > 1:
         chosen = f"cuda:{LOCAL_RANK}"  # each process has its own
-    if chosen not in names:
-        raise UserError(f"--device {name} is not there: this machine has {', '.join(names)}")
+    need(chosen in names, f"--device {name} is not there: this machine has {', '.join(names)}")
     return torch.device(chosen)
 
 
@@ -2313,7 +2278,7 @@ def check(cfg: Config) -> None:
 
 
 def execute(cfg: Config, arrays, run: Path, saved: dict | None = None) -> dict:
-    """Trains and scores one model on a scene file or its dictionary; returns its metrics."""
+    """Trains and scores one model on the dictionary of a scene file; returns its metrics."""
     device = pick_device(cfg.device)
     scene = load_scene(arrays, device, cfg.mask_px)
     run.mkdir(parents=True, exist_ok=True)

@@ -3459,6 +3459,16 @@ def test_meter_thread_ticks_and_ends():
     assert not meter.thread.is_alive() and meter.sampled_joules == len(ticks) - 1
 
 
+def test_a_reading_that_fails_in_mid_run_leaves_null_and_ends_nothing(capsys):
+    bench = Bench()
+    bench.window(10, 500)
+    bench.meter.power = lambda: 1 / 0
+    bench.window(10, 500)
+    bench.window(10, 500)
+    assert all(bench.meter.report()[k] is None for k in ("energy_wh", "energy_wh_sampled", "energy_source"))
+    assert capsys.readouterr().out.count("energy is null") == 1
+
+
 def powercap(root, packages, wrap=1_000_000):
     for name, energy in packages.items():
         (root / name).mkdir(exist_ok=True)
@@ -3639,7 +3649,7 @@ def test_a_diverged_run_of_a_matrix_is_a_result(arrays, tmp_path, brief, monkeyp
     poisoned(monkeypatch)
     monkeypatch.setattr(g, "find_scene", lambda cfg: arrays)
     metrics = g.run_once(TINY | dict(steps=1000), tmp_path / "run")
-    assert "finite" in metrics["failed"] and g.has_failed(metrics)
+    assert "finite" in metrics["failed"] and g.table_line({}, [metrics])["failures"] == 1
     assert g.run_once(TINY | dict(steps=1000), tmp_path / "run") == metrics
 
 
@@ -4173,7 +4183,7 @@ def fake_lpips():
         trunk[f"features.{index}.weight"] = torch.randn(b, a, k, k) * (2 / (a * k * k)) ** 0.5
         trunk[f"features.{index}.bias"] = torch.randn(b) * 0.1
         heads[f"lin{i}.model.1.weight"] = torch.rand(1, b, 1, 1)
-    return g.LPIPS().load(trunk, heads), trunk, heads
+    return g.lpips_from(trunk, heads), trunk, heads
 
 
 def test_lpips_is_zero_for_equal_pictures_symmetric_and_grows_with_the_difference():
@@ -4210,10 +4220,12 @@ def test_half_pixels_are_disjoint_and_complete(odd):
         assert sorted(left + right) == list(range(w * h)) and {p % w for p in left} == set(range(w // 2))
 
 
-def test_floor_picture_is_the_mean_colour_of_each_row_of_the_left_half():
-    truth = random(4, 7, 3).numpy()
-    want = [[[round(255 * sum(truth[i, j, c] for j in range(3)) / 3) for c in range(3)]] for i in range(4)]
-    assert g.floor_picture(truth).tolist() == want
+def test_the_trivial_predictor_is_the_mean_colour_of_each_row_of_the_left_half():
+    truth = g.to_uint8(random(16, 7, 3).numpy()) / 255
+    flat = [[[round(255 * sum(truth[i, j, c] for j in range(3)) / 3) for c in range(3)]] * 4 for i in range(16)]
+    row = g.score(dict(rgb=truth, truth=truth), None, "cpu")
+    assert row["psnr_floor"] == pytest.approx(g.psnr(np.array(flat, np.uint8), g.to_uint8(truth)[:, 3:]), abs=1e-9)
+    assert row["psnr"] == 100
 
 
 def test_to_uint8_rounds_and_clips():
@@ -4336,6 +4348,8 @@ def test_validation_is_the_mean_of_the_photos_own_psnr(scene, monkeypatch):
     model = SimpleNamespace(render=lambda rays, code: dict(
         rgb=rays.rgb + torch.tensor([off[i] for i in rays.img.tolist()])[:, None]))
     assert g.validate(model, scene, photos, None)[1] == pytest.approx(30, abs=1e-3)
+    off |= dict.fromkeys(off, 0.0)
+    assert g.validate(model, scene, photos, None)[1] == pytest.approx(100)  # a perfect view has a finite score
 
 
 def test_rendering_a_photo_keeps_its_shape_and_pixel_order_whatever_the_chunk(warm, scene, monkeypatch):
@@ -4483,8 +4497,10 @@ def test_summary_is_mean_and_spread_and_none_when_nothing_was_measured():
 
 
 def test_table_leaves_cells_empty_that_were_not_measured(tmp_path):
-    g.write_table(tmp_path / "a.csv", [dict(x=1.23456789, y=None, z="n"), dict(x=2, y=3.0, z="m, k")])
+    rows = [dict(x=1.23456789, y=None, z="n"), dict(x=2, y=3.0, z="m, k")]
+    g.publish(str(tmp_path / "a"), rows, SimpleNamespace(savefig=lambda tmp, **_: tmp.write_text("drawn")))
     assert (tmp_path / "a.csv").read_text() == 'x,y,z\n1.2346,,n\n2,3,"m, k"\n'
+    assert (tmp_path / "a.png").read_text() == "drawn"
 
 
 def finished(folder, **metrics):
@@ -4621,6 +4637,17 @@ def test_ablation_fills_its_table_with_depths_around_the_footprints(tmp_path, mo
     assert [row[0] for row in rows] == ["full", "half depth", "double depth"] and (tmp_path / "ablation.png").exists()
     levels = [g.read_metrics(p)["config"]["levels"] for p in sorted((tmp_path / "runs" / "ablation-toy").iterdir())]
     assert levels == [2, 1, 1]  # double, full, half: not below one level
+
+
+def test_an_ablation_of_nothing_but_diverged_runs_is_a_table_of_failures(tmp_path, monkeypatch, arrays, brief):
+    monkeypatch.chdir(tmp_path)
+    data_prep.write_scene(tmp_path / "data" / "toy.npz", arrays)
+    monkeypatch.setattr(g, "PIECES", {"full": {}})
+    poisoned(monkeypatch)
+    g.ablation(TINY | dict(steps=2 * g.PATIENCE), 1, 1)
+    head, row = [line.split(",") for line in (tmp_path / "ablation.csv").read_text().splitlines()]
+    line = dict(zip(head, row))
+    assert line["failures"] == "1" and line["psnr"] == "" and (tmp_path / "ablation.png").exists()
 
 
 # ---- 13 command line -----------------------------------------------------------------------------------
@@ -4862,6 +4889,15 @@ def test_a_run_without_scores_is_no_row_of_a_chart(desk, capsys):
     run = Path(finished(desk / "a", method="geonvsw"))
     (run / "metrics.json").write_text(json.dumps(g.read_metrics(run) | dict(psnr=None)))
     assert command("--chart", str(run)) == 2 and "no scores" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("text", ["", "[1]", "{}", "{\"psnr\": 1"])
+def test_metrics_that_are_none_get_one_sentence(desk, capsys, text):
+    (desk / "a").mkdir()
+    (desk / "a" / "metrics.json").write_text(text)
+    assert command("--chart", str(desk / "a")) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and "a/metrics.json is damaged" in error
 
 
 def test_lpips_weights_that_cannot_be_read_leave_null(monkeypatch, capsys):
