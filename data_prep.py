@@ -414,7 +414,8 @@ def finish(scene, c2w, points, track_photo, track_point, pixels, contain, info):
         uv, distance = project(scene["K"][i], c2w[i], x[point[own]])
         near[i] = max(0.8 * np.quantile(distance, 0.02), 0.02)
         miss.append(np.linalg.norm(uv - pixels[ok[own]], axis=1))
-    need(miss, "no photo observes a usable 3D point: photos and points do not belong together")
+    need((~scene["is_test"])[photo].any(), "no training photo observes a usable 3D point: photos "
+         "and points do not belong together")
     info["reprojection_px"] = float(np.median(np.concatenate(miss)))
     return statistics(dict(
         scene, wh=wh, start=np.append(0, np.cumsum(wh.prod(1, dtype=np.int64))), c2w=c2w,
@@ -465,7 +466,8 @@ UNDISTORT = "colmap image_undistorter --image_path images --input_path sparse --
 
 def open_binary(path):
     """Bounded reader of a little-endian file. -> take(format), count(bytes of a record)"""
-    need(path.is_file(), f"{path} is missing: copy the whole COLMAP model")
+    need(path.is_file(), f"{path} is missing: copy the whole COLMAP model; one in text becomes "
+         "binary by colmap model_converter --output_type BIN")
     data, at = path.read_bytes(), 0
 
     def take(form):
@@ -524,7 +526,7 @@ def read_colmap(sparse):
 def read_split(path):
     """NeRF-W table, by column name: {photo: "train" or "test"}; rows with empty id are dropped."""
     need(Path(path).is_file(), f"the split file {path} is not there")
-    lines = Path(path).read_bytes().decode(errors="replace").splitlines()
+    lines = Path(path).read_bytes().decode("utf-8-sig", "replace").splitlines()
     head, *rows = [line.split("\t") for line in lines if line] or [[]]
     need({"filename", "split"} <= set(head), f"{path} needs a header with filename, tab, and split")
     split = {}
@@ -544,14 +546,17 @@ def read_photo(path, camera, uv, downscale):
         image = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     except cv2.error:
         image = None
-    need(image is not None, f"cannot read {path}; replace it, or take it out of the split file")
+    need(image is not None, f"cannot read {path}: replace it, or delete it and go without")
     need(image.shape[:2] == (h, w), f"{path} is {image.shape[1]} x {image.shape[0]}, its camera "
          f"{w} x {h}; use the photos that belong to this reconstruction")
     if bend.any():                                           # OpenCV's first pixel is at 0
         M = np.array([[K[0], 0, K[2] - 0.5], [0, K[1], K[3] - 0.5], [0, 0, 1]])
-        image = cv2.undistort(image, M, bend)
+        P = cv2.getOptimalNewCameraMatrix(M, bend, (w, h), 0)[0]   # shows nothing but photo
+        P = P if P[0, 0] > M[0, 0] or P[1, 1] > M[1, 1] else M
+        image = cv2.undistort(image, M, bend, None, P)
         if len(uv):
-            uv = cv2.undistortPoints(uv[:, None] - 0.5, M, bend, P=M)[:, 0] + 0.5
+            uv = cv2.undistortPoints(uv[:, None] - 0.5, M, bend, P=P)[:, 0] + 0.5
+        K = np.array([P[0, 0], P[1, 1], P[0, 2] + 0.5, P[1, 2] + 0.5])
     small = w // downscale, h // downscale
     need(min(small) >= 2, f"--downscale {downscale} leaves nothing of {path.name}: use a smaller")
     image = cv2.cvtColor(cv2.resize(image, small, interpolation=cv2.INTER_AREA), cv2.COLOR_BGR2RGB)
@@ -567,14 +572,15 @@ def prepare(folder, downscale=2, split=None):
         if names:
             left_out.append(f"{len(names)} photos {why}: {', '.join(sorted(names)[:3])}, ...")
             print(left_out[-1], file=sys.stderr)
-    root = folder / "dense" if (folder / "dense").is_dir() else folder
+    roots = folder / "dense", folder / "dense" / "0", folder   # COLMAP numbers them, or not
+    root = next((r for r in roots if (r / "images").is_dir() and (r / "sparse").is_dir()), folder)
     sparse = root / "sparse" / "0" if (root / "sparse" / "0").is_dir() else root / "sparse"
     fix = f"{folder.name} --download" if folder.name in SCENES else f"{folder} --sfm"
     need((root / "images").is_dir() and sparse.is_dir(),
          f"{folder} has no folders images and sparse; run: python data_prep.py {fix}")
     need(downscale >= 1, f"--downscale is a whole number from 1, not {downscale}")
     cameras, photos, points = read_colmap(sparse)
-    tables = [Path(split)] if split else sorted(folder.glob("*.tsv"))
+    tables = [Path(split)] if split else sorted(folder.glob("[!.]*.tsv"))
     need(len(tables) < 2, f"{folder} has {len(tables)} split files: keep one, or name one by "
          "data_prep.py --split")
     here = sorted(name for name in photos if (root / "images" / name).is_file())
@@ -632,7 +638,9 @@ def fetch(url, path):
             raise OSError(f"{have} of {total} bytes came")
         os.replace(part, path)
     except (OSError, http.client.HTTPException) as e:
-        if getattr(e, "code", 0) == 416:                     # the part is not of this file
+        if getattr(e, "code", 0) == 416:                     # the part is whole, or of another file
+            if e.headers.get("Content-Range") == f"bytes */{have}":
+                return os.replace(part, path)
             part.unlink()
         raise UserError(f"the download of {url} broke ({e}); the same command continues it") from e
 
@@ -642,8 +650,11 @@ def download(name, data_root="data", archive_url=ARCHIVE_URL, split_url=SPLIT_UR
     need(name in SCENES, f"--download knows {', '.join(SCENES)}, not {name}")
     (scene, table), root = SCENES[name], Path(data_root)
     archive, temporary = root / f"{scene}.tar.gz", root / f".{name}.{os.getpid()}"
-    if (root / name).is_dir():
+    if (root / name / "dense").is_dir():
         return
+    need(not (root / name).exists(),
+         f"{root / name} is in the way of the archive: move it, or leave --download out")
+    need(hasattr(tarfile, "data_filter"), "unpacking needs Python 3.10.12, 3.11.4 or newer")
     for url, path in (split_url + table, root / table), (archive_url + archive.name, archive):
         if not path.exists():
             fetch(url, path)
@@ -684,7 +695,8 @@ def run_sfm(folder):
 def locate_and_prepare(name, data_root="data", downscale=2, split=None):
     """Scene of one of SCENES from its unpacked archive, under its short or its long name."""
     short, long = (Path(data_root) / folder for folder in (name, SCENES[name][0]))
-    return prepare(short if short.is_dir() or not long.is_dir() else long, downscale, split)
+    is_short = (short / "dense").is_dir() or not long.is_dir()
+    return prepare(short if is_short else long, downscale, split)
 
 
 def main(argv=None):
@@ -693,7 +705,7 @@ def main(argv=None):
     p.add_argument("scene", help=f"toy, {', '.join(SCENES)}, or a folder")
     p.add_argument("--download", action="store_true", help="fetch archive and split file first")
     p.add_argument("--sfm", action="store_true", help="the folder has raw photos: pose them first")
-    p.add_argument("--downscale", type=int, default=2, help="photos get this many times smaller")
+    p.add_argument("--downscale", type=int, help="photos get this many times smaller; default 2")
     p.add_argument("--split", help="table of training and test photos; default: <folder>/*.tsv")
     p.add_argument("--out", help="default: data/<scene>.npz")
     knobs = {key: knob.default for key, knob in inspect.signature(make_toy).parameters.items()}
@@ -701,10 +713,14 @@ def main(argv=None):
         how = {"action": argparse.BooleanOptionalAction} if value is True else {"type": type(value)}
         p.add_argument(f"--{key}", default=None, help=f"toy, default {value}", **how)
     a = p.parse_args(argv)
-    out = a.out or scene_path(a.scene, a.scene not in ("toy", *SCENES))
+    out = Path(a.out) if a.out else scene_path(a.scene, a.scene not in ("toy", *SCENES))
     set_knobs = {key: value for key in knobs if (value := getattr(a, key)) is not None}
     try:
         need(a.scene == "toy" or not set_knobs, f"--{', --'.join(set_knobs)}: for the toy only")
+        need(a.scene != "toy" or a.downscale is a.split is None,
+             "--downscale and --split are for photos: the toy takes --size and --test")
+        need(out.suffix == ".npz", f"--out {out}: name a file that ends in .npz")
+        downscale = 2 if a.downscale is None else a.downscale
         if a.download:
             download(a.scene)
         if a.sfm:
@@ -712,11 +728,11 @@ def main(argv=None):
         if a.scene == "toy":
             scene = make_toy(**set_knobs)
         elif a.scene in SCENES:
-            scene = locate_and_prepare(a.scene, downscale=a.downscale, split=a.split)
+            scene = locate_and_prepare(a.scene, downscale=downscale, split=a.split)
         else:
-            scene = prepare(a.scene, a.downscale, a.split)
+            scene = prepare(a.scene, downscale, a.split)
         write_scene(out, scene)
-    except (UserError, OSError, KeyboardInterrupt) as e:
+    except (UserError, OSError, MemoryError, KeyboardInterrupt) as e:
         print(f"error: {e}" if str(e) else "error: stopped; start again", file=sys.stderr)
         sys.exit(2)
     print(f"{out}: {len(scene['wh'])} photos, {scene['is_test'].sum()} of them for testing, "

@@ -42,8 +42,8 @@ Where the printed paper is departed from, the line carries its tag:
 """
 from __future__ import annotations
 
-import argparse, contextlib, csv, difflib, functools, io, itertools, json, math, os, shutil
-import signal, subprocess, sys, threading, time
+import argparse, contextlib, csv, datetime, difflib, functools, io, itertools, json, math, os
+import shutil, signal, subprocess, sys, threading, time
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, field, fields
 from multiprocessing import get_context, parent_process
@@ -61,6 +61,8 @@ from torch import Tensor, nn
 
 import data_prep
 from data_prep import UserError, atomic_write, need
+
+torch.set_float32_matmul_precision("highest")  # [D9] no TF32, which some containers switch on
 
 
 # ---- 1 Config: every field is a flag -------------------------------------------------------------
@@ -360,8 +362,9 @@ class Octree(nn.Module):
             n = self.resolution(level)
             self.cells.append(ijk)
             n_nodes += len(ijk)
-            keys, inverse, count = torch.unique(self.key(ijk[:, None] + octant, level),
-                                                return_inverse=True, return_counts=True)
+            keys, inverse, count = torch.unique(
+                self.key(ijk, level)[:, None] + self.key(octant, level),  # (N,8), as key is linear
+                return_inverse=True, return_counts=True)
             at = torch.stack([keys // (n + 1) ** 2, keys // (n + 1), keys], 1) % (n + 1)  # corners
             free = count == 2 ** ((at > 0) & (at < n)).sum(1)  # all cells around it exist
             corner.append(torch.where(free, n_rows - 1 + free.cumsum(0), 0)[inverse])  # (N,8)
@@ -791,16 +794,16 @@ HIDDEN = 6.0  # zeta |s| from where on the field is not seen: sigmoid(-6) = 0.00
 
 
 def worth_splitting(octree: Octree, level: int, hits: Tensor, bound: float) -> Tensor:
-    """Cells (Q,3) where enough rays end, that miss their colour by more than bound on average, and
-    to whose pixels the children are not too fine; worst first. hits: (P,5), the rays' ends, errors
-    and pixel sizes there."""
-    at, which, count = octree.cell_of(hits[:, :3], level).unique(
-        dim=0, return_inverse=True, return_counts=True)
-    mean = hits.new_zeros(len(at), 2).index_add_(0, which, hits[:, 3:]) / count[:, None]  # (Q,2)
+    """Keys (Q,) of cells where enough rays end, that miss their colour by more than bound on
+    average, and to whose pixels the children are not too fine; worst first. hits: (P,5), the rays'
+    ends, errors and pixel sizes there."""
+    key, which, count = octree.key(octree.cell_of(hits[:, :3], level), level).unique(
+        return_inverse=True, return_counts=True)  # (Q,), (P,), (Q,)
+    mean = hits.new_zeros(len(key), 2).index_add_(0, which, hits[:, 3:]) / count[:, None]  # (Q,2)
     error, pixel = mean.unbind(1)  # (Q,)
     pays = (count >= SPLIT_RAYS) & (error > bound) & (pixel < octree.cell(level) / 2)  # (Q,)
     worst = error.argsort(descending=True)
-    return at[worst[pays[worst]]]
+    return key[worst[pays[worst]]]
 
 
 class GeoNVS(Method):
@@ -977,7 +980,8 @@ class GeoNVS(Method):
         n = self.cache.shape[-1]
         line = torch.linspace(-1, 1, n, device=self.cache.device)  # (n,)
         x = torch.cartesian_prod(line[part::parts], line, line)  # (P,3)
-        s = torch.cat([self.sdf(some)[0] for some in x.split(2 ** 15)])  # (P,)
+        size = 2 ** 18 if x.is_cuda else 2 ** 15  # launches bind a GPU, its cache a CPU
+        s = torch.cat([self.sdf(some)[0] for some in x.split(size)])  # (P,)
         self.cache[0, 0, part::parts] = s.reshape(-1, n, n)
 
     @torch.no_grad()
@@ -997,7 +1001,7 @@ class GeoNVS(Method):
             key = octree.key(octree.cells[level], level)  # (N,)
             keys[level] = keys[level][torch.isin(keys[level], key[s.abs() < reach + HIDDEN / zeta])]
             bound = self.cfg.split_error * self.level
-            new = octree.key(worth_splitting(octree, level, hits, bound), level)
+            new = worth_splitting(octree, level, hits, bound)  # (Q,)
             new = new[torch.isin(new, key[s.abs() < reach]) & ~torch.isin(new, keys[level])][:room]
             room -= len(new)
             keys[level] = torch.cat([keys[level], new])
@@ -1518,6 +1522,7 @@ def train(cfg: Config, scene: Scene, run: Path, saved: dict | None = None):
             if state["step"] % PATIENCE == 0 and int(streak) >= PATIENCE:
                 break
             if cfg.curve and len(held_out) and seconds > 4 * 1.6 ** len(state["curve"]):
+                int(dropped)  # waits for a GPU: what it has queued is training
                 state["seconds"] = clock()
                 meter.stop()  # looking costs neither time nor energy
                 state["codes"], value = (None, 0) if RANK else validate(
@@ -1858,6 +1863,8 @@ def panel(model, frames: list[tuple[str, dict]], height: int = 180) -> np.ndarra
 
 def finish(model, scene: Scene, cfg: Config, state: dict, energy: dict, run: Path) -> dict:
     """Scores a trained model and writes metrics.json, panel.png and mesh.ply below run."""
+    is_gpu = scene.c2w.is_cuda
+    peak = torch.cuda.max_memory_allocated() if is_gpu else None  # of training, not of scoring
     scores = evaluate(model, scene, cfg, make_lpips(scene.c2w.device))
     frames = [(f"held out: {name}", frame) for name, frame in scores.pop("frames")]
     busy = scene.photos(False)
@@ -1869,8 +1876,7 @@ def finish(model, scene: Scene, cfg: Config, state: dict, energy: dict, run: Pat
     write_png(run / "panel.png", panel(model, frames))
     if hasattr(model, "sdf"):
         write_ply(run / "mesh.ply", *extract_mesh(model))
-    octrees, is_gpu = model.octrees(), scene.c2w.is_cuda
-    cpu = f"cpu, {torch.get_num_threads()} threads"
+    octrees, cpu = model.octrees(), f"cpu, {torch.get_num_threads()} threads"
     structure = sum(o.bytes() - 4 * o.features.numel() for o in octrees)
     git = ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short", "HEAD"]
     fitted = "left half" if cfg.protocol == "half" else "WHOLE photo (leaky)"
@@ -1884,7 +1890,7 @@ def finish(model, scene: Scene, cfg: Config, state: dict, energy: dict, run: Pat
         octree_cells=[len(c) for o in octrees[:1] for c in o.cells] or None,
         octree_bytes=octrees[0].bytes() if octrees else None,
         model_bytes=sum(p.numel() * p.element_size() for p in model.parameters()) + structure,
-        peak_memory_bytes=torch.cuda.max_memory_allocated() if is_gpu else peak_rss(),
+        peak_memory_bytes=peak if is_gpu else peak_rss(),
         protocol=f"appearance fitted on the {fitted}, scored on the right half",
         torch=torch.__version__, python=sys.version.split()[0], config=asdict(cfg),
         commit=shutil.which("git") and subprocess.run(
@@ -2237,14 +2243,18 @@ def scene_file(cfg: Config) -> Path:
 
 
 def find_scene(cfg: Config) -> dict:
-    """The scene of a configuration from its file, made on first use or when the folder's split
-    file is newer. Raises UserError."""
+    """The scene of a configuration from its file, made on first use or when the split file or the
+    reconstruction of its folder is newer. Raises UserError."""
     path, is_toy = scene_file(cfg), not cfg.data and cfg.scene == "toy"
     scene = data_prep.read_scene(path) if path.exists() else None
     info = json.loads(str(scene["info"])) if scene else {}
     split = info.get("split")  # named by data_prep.py --split
-    tables = [Path(split)] if split else Path(cfg.data).glob("*.tsv") if cfg.data and scene else ()
-    is_old = any(t.exists() and t.stat().st_mtime > path.stat().st_mtime for t in tables)
+    folders = [cfg.data] if cfg.data else [] if is_toy else [
+        f"data/{name}" for name in (cfg.scene, data_prep.SCENES[cfg.scene][0])]
+    sources = [Path(split)] if split else [t for f in folders for t in Path(f).glob("[!.]*.tsv")]
+    sources += [model for f in folders for model in Path(f).glob("**/images.bin")]
+    is_old = scene and any(
+        s.exists() and s.stat().st_mtime > path.stat().st_mtime for s in sources)
     if scene and not is_old and (is_toy or info["downscale"] == cfg.downscale):
         return scene
     print(f"making {path}")
@@ -2323,7 +2333,8 @@ def main(argv: list[str] | None = None) -> None:
     if device.type == "cuda":
         torch.cuda.set_device(device)
     if RANKS > 1:
-        dist.init_process_group("cpu:gloo,cuda:nccl" if device.type == "cuda" else "gloo")
+        dist.init_process_group("cpu:gloo,cuda:nccl" if device.type == "cuda" else "gloo",
+                                timeout=datetime.timedelta(days=1))  # the first scores alone
         sys.stdout = open(os.devnull, "w") if RANK else sys.stdout
     if commands.get("chart"):
         runs = [read_metrics(Path(run)) for run in commands["chart"]]

@@ -398,7 +398,7 @@ def test_colmap_model_comes_back(tmp_path):
         assert seen.tolist() == [2 ** 63 + 5, 17] and uv.tolist() == [[1.5 + i, 2.5], [5., 6.]]
 
 
-@pytest.mark.parametrize("sub", ["dense", "."])
+@pytest.mark.parametrize("sub", ["dense", ".", "dense/0"])
 def test_toy_survives_the_way_through_colmap_files(tmp_path, source, sub):
     as_colmap(tmp_path, source, sub=sub)
     s = data_prep.prepare(tmp_path, downscale=1)
@@ -511,6 +511,8 @@ def test_foreground_sphere_ignores_wild_points_and_prefers_what_many_see():
 def test_split_is_read_by_column_name(tmp_path):
     want = {"a b.jpg": "test", "sub/c.jpg": "train"}
     for text in ("filename\tid\tsplit\tdataset\na b.jpg\t1.0\ttest\tx\nsub/c.jpg\t2.0\ttrain\tx\nno.jpg\t\ttrain\tx\n",
+                 "\ufefffilename\tid\tsplit\na b.jpg\t1\ttest\nsub/c.jpg\t2\ttrain\nno.jpg\t\ttrain\n",
+                 "\ufeffid\tfilename\tsplit\n1\ta b.jpg\ttest\n2\tsub/c.jpg\ttrain\n\tno.jpg\ttrain\n",
                  "id\tsplit\tfilename\tdataset\r\n1\ttest\ta b.jpg\tx\r\n2\ttrain\tsub/c.jpg\tx\r\n",
                  "\tsplit\tnima\tfilename\n0\ttest\t5.1\ta b.jpg\n1\ttrain\t4\tsub/c.jpg\n"):
         (tmp_path / "s.tsv").write_bytes(text.encode())
@@ -648,6 +650,38 @@ def test_bad_input_gives_one_line_and_exit_code_2(tmp_path, source, what):
         code, out, err = run_main(tmp_path / "place", "--out", tmp_path / "x.npz")
     assert code == 2 and out == "" and err.count("\n") == 1 and err.startswith("error: ")
     assert CASES[what] in err and not (tmp_path / "x.npz").exists()
+
+
+def test_hidden_files_beside_the_split_are_not_read(folder):
+    (folder / "._toy.tsv").write_bytes(b"what a Mac leaves on other disks")
+    assert data_prep.prepare(folder)["is_test"].sum() == 2
+
+
+def test_points_that_only_test_photos_observe_make_no_scene(tmp_path, source):
+    cameras, images, points = as_colmap(tmp_path, source)
+    for i, image in enumerate(images):
+        image[5][:] = image[5] if source["is_test"][i] else image[5][-1:]
+    write_colmap(tmp_path / "dense" / "sparse", cameras, images, points)
+    with pytest.raises(UserError, match="no training photo observes"):
+        data_prep.prepare(tmp_path)
+
+
+@pytest.mark.parametrize("bend", [(.2, 0, 0, 0), (-.15, .02, 0, 0), (.1, 0, .01, -.01)])
+def test_an_undistorted_photo_shows_nothing_but_photo_where_its_camera_says(tmp_path, bend):
+    """A photo whose grey is linear in the direction; a frame of other grey would be trained on."""
+    w, h, K = 90, 60, np.array([70.0, 72, 44, 31])
+    grey = lambda x, y: 110 + 60 * x + 40 * y
+    v, u = np.mgrid[:h, :w] + .5
+    x0, y0 = (u - K[2]) / K[0], (v - K[3]) / K[1]
+    x, y, (k1, k2, p1, p2) = x0.copy(), y0.copy(), bend
+    for _ in range(200):
+        r2 = x * x + y * y
+        x += .5 * (x0 - x * (1 + k1 * r2 + k2 * r2 * r2) - 2 * p1 * x * y - p2 * (r2 + 2 * x * x))
+        y += .5 * (y0 - y * (1 + k1 * r2 + k2 * r2 * r2) - 2 * p2 * x * y - p1 * (r2 + 2 * y * y))
+    cv2.imwrite(str(tmp_path / "a.png"), grey(x, y).round().astype(np.uint8))
+    rgb, K, _ = data_prep.read_photo(tmp_path / "a.png", (w, h, K, np.array(bend)), np.zeros((0, 2)), 1)
+    want = grey((u - K[2]) / K[0], (v - K[3]) / K[1])
+    assert np.abs(rgb[..., 0] - want).max() < 3
 
 
 def test_very_narrow_and_very_wide_photos_are_left_out(tmp_path, source):
@@ -907,7 +941,9 @@ class Server(http.server.BaseHTTPRequestHandler):
         if data is None:
             return self.send_error(404)
         if start >= len(data) > 0 and start:
-            return self.send_error(416)
+            self.send_response(416)
+            self.send_header("Content-Range", f"bytes */{len(data)}")
+            return self.end_headers()
         self.send_response(206 if start else 200)
         self.send_header("Content-Length", str(len(data) - start))
         self.end_headers()
@@ -988,6 +1024,21 @@ def test_a_part_longer_than_the_file_is_started_over(server, tmp_path):
     assert len(unpacked(tmp_path)) == 3
 
 
+def test_a_whole_part_is_not_fetched_again(server, tmp_path):
+    part = tmp_path / "data" / "brandenburg_gate.tar.gz.part"
+    part.parent.mkdir()
+    part.write_bytes(server.files["/t/brandenburg_gate.tar.gz"])
+    server.get()
+    assert len(unpacked(tmp_path)) == 3 and not part.exists() and len(server.asked) == 2
+
+
+def test_a_folder_in_the_way_of_an_archive_is_named(server, tmp_path):
+    (tmp_path / "data" / "brandenburg").mkdir(parents=True)
+    with pytest.raises(UserError, match="in the way"):
+        server.get()
+    assert not server.asked
+
+
 def test_missing_file_and_dead_server_are_said(server, tmp_path):
     server.files = {}
     with pytest.raises(UserError, match="404"):
@@ -1025,6 +1076,7 @@ def test_damaged_archives_are_named_and_leave_nothing(server, tmp_path, damage_f
 def test_locate_and_prepare_finds_the_archive_or_names_the_command(tmp_path, source):
     with pytest.raises(UserError, match="python data_prep.py sacre --download"):
         data_prep.locate_and_prepare("sacre", tmp_path)
+    (tmp_path / "sacre").mkdir()
     for folder in ("sacre_coeur", "sacre"):   # unpacked by hand, or by --download
         as_colmap(tmp_path / folder, source)
         s = data_prep.locate_and_prepare("sacre", tmp_path, downscale=2)
@@ -1045,12 +1097,22 @@ def test_command_line_makes_a_toy_and_reads_a_folder(tmp_path, source, monkeypat
 @pytest.mark.parametrize("argv", [["toy", "--sizee", "9"], ["toy", "--siz", "9"], ["toy", "--size", "x"], [],
                                   ["nowhere"], ["brandenburg"], ["nowhere", "--download"], ["place", "--size", "9"],
                                   ["toy", "--occluders", "2"], ["place", "--downscale", "0"],
-                                  ["toy", "--pose_noise", "nan"], ["toy", "--pose_noise", "inf"]])
+                                  ["toy", "--pose_noise", "nan"], ["toy", "--pose_noise", "inf"],
+                                  ["toy", "--out", "mine"], ["toy", "--out", "."], ["toy", "--downscale", "4"],
+                                  ["toy", "--split", "x.tsv"]])
 def test_misspelt_commands_exit_with_2(tmp_path, monkeypatch, argv):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "place").mkdir()
     code, out, err = run_main(*argv)
     assert code == 2 and out == "" and "error: " in err and "Traceback" not in err
+    assert [p.name for p in tmp_path.rglob("*")] == ["place"]
+
+
+def test_a_toy_beyond_memory_is_refused_in_one_line(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(data_prep, "trace", lambda *_: np.empty((2 ** 24, 2 ** 24)))
+    code, _, err = run_main("toy", "--photos", 4, "--test", 0)
+    assert code == 2 and err.count("\n") == 1 and "allocate" in err
 
 
 def test_sfm_says_what_to_install_and_calls_pycolmap_in_order(tmp_path, monkeypatch, source):
@@ -4816,6 +4878,23 @@ def test_a_folders_scene_is_the_one_that_data_prep_made_until_its_split_changes(
             (desk / "place" / "split.tsv").write_text("x")
             os.utime(desk / "place" / "split.tsv", (4e9, 4e9) if len(made) == 1 else (0, 0))
         g.find_scene(SimpleNamespace(data="place", scene="toy", downscale=downscale))
+        assert len(made) == want
+
+
+@pytest.mark.parametrize("given, home", [(dict(scene="sacre"), "data/sacre"), (dict(data="place"), "place"),
+                                         (dict(scene="sacre"), "data/sacre_coeur")])
+def test_a_scene_is_made_anew_when_its_split_or_its_poses_are(desk, monkeypatch, arrays, given, home):
+    """Otherwise test photos would be trained on, or old poses, without a word."""
+    made = []
+    for maker in ("prepare", "locate_and_prepare"):
+        monkeypatch.setattr(data_prep, maker, lambda *_: (made.append(0), arrays)[1])
+    downscale = json.loads(str(arrays["info"]))["downscale"]
+    model, split = desk / home / "dense/sparse/0/images.bin", desk / home / "x.tsv"
+    model.parent.mkdir(parents=True)
+    for source, when, want in ((model, 0, 1), (model, 0, 1), (model, 4e9, 2), (model, 0, 2), (split, 4e9, 3), (split, 0, 3)):
+        source.touch()
+        os.utime(source, (when, when))
+        g.find_scene(config(downscale=downscale, **given))
         assert len(made) == want
 
 
