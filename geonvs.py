@@ -1782,9 +1782,12 @@ def extract_mesh(model: GeoNVS, resolution: int = 0) -> tuple[np.ndarray, np.nda
     volume = torch.ones_like(cached)
     for index in torch.nonzero(near).split(2 ** 16) if near.any() else ():  # (P,3)
         volume[tuple(index.T)] = model.sdf(index * (2 / n) - 1.0)[0]
-    far, high, low = (F.max_pool3d(v[None], 2, 1)[0] for v in (-near.float(), volume, -volume))
-    cubes = (far < 0) & (high > 0) & (low >= 0)  # (n,n,n): all corners evaluated, s changes sign
-    cubes = F.pad(cubes, (1, 0) * 3)  # skimage looks a cube up at its last corner
+    cubes = []
+    for slab in (slice(i, i + 65) for i in range(0, n, 64)):  # all at once would take gigabytes
+        far, high, low = (F.max_pool3d(v[None], 2, 1)[0]
+                          for v in (-near[slab].float(), volume[slab], -volume[slab]))
+        cubes.append((far < 0) & (high > 0) & (low >= 0))  # corners evaluated, s changes sign
+    cubes = F.pad(torch.cat(cubes), (1, 0) * 3)  # skimage looks a cube up at its last corner
     if not cubes.any():
         return np.zeros((0, 3)), np.zeros((0, 3), int), np.zeros((0, 3), np.uint8)
     vertices, faces, _, _ = marching_cubes(volume.cpu().numpy(), 0, mask=cubes.cpu().numpy(),

@@ -4427,7 +4427,7 @@ def test_rendering_a_photo_keeps_its_shape_and_pixel_order_whatever_the_chunk(wa
 
 @pytest.fixture(scope="session")
 def mesh(warm):
-    return g.extract_mesh(warm, 48)
+    return g.extract_mesh(warm, 120)  # two slabs
 
 
 def test_mesh_of_the_warm_up_sphere_is_that_sphere_in_sfm_units(warm, scene, mesh):
