@@ -2,7 +2,7 @@
 
 A minimal single-file reference implementation of "Geo-NVS-w: Geometry-Aware Novel View Synthesis
 In-the-Wild with an SDF Renderer" (Tsalakopoulos et al., ICCV 2025 workshops). Read it from the top:
-the sections follow one ray from the pixel to the loss, then the training loop around it.
+sections 2-7 follow one ray from the pixel to the loss, then comes the training loop around it.
 
     python geonvs.py                       toy scene: made, trained, scored (minutes, 2 CPU cores)
     python geonvs.py --scene brandenburg   a Phototourism scene (one GPU); also sacre, trevi, taj
@@ -10,10 +10,7 @@ the sections follow one ray from the pixel to the loss, then the training loop a
     torchrun --nproc_per_node 4 geonvs.py  on 4 GPUs that share the rays of each step
     python geonvs.py --help                every setting with its meaning, unit and source
 
-A run writes runs/<name>/: metrics.json, log.jsonl, checkpoint.pt, panel.png and a mesh.ply.
-
-Sections: 1 config, 2 scene and rays, 3 octree, 4 fields, 5 from SDF to colour, 6 mask and GPL,
-7 model and objective, 8 baselines, 9 energy, 10 training, 11 scoring, 12 experiments, 13 commands.
+A run writes runs/<name>/: metrics.json, log.jsonl, checkpoint.pt, panel.png and mesh.ply.
 
 Conventions, stated once
   world     the foreground is the unit sphere; x_file = x * scale + center leads back to SfM units
@@ -21,8 +18,8 @@ Conventions, stated once
   rays      r(t) = o + t d with |d| = 1, so t is a distance along the ray and not a z-depth
   sdf       positive outside; the normal is the unit gradient; colours are sRGB in [0, 1]
   mask      M = 1 means transient (person, car), M = 0 means scene
-  shapes    R rays, S samples per ray, P points, L octree levels, C channels per level,
-            V octree corners, A appearance dims, I photos, K sparse points, T sightings of them
+  shapes    R rays, S samples per ray, P points, L octree levels, C channels per level, V octree
+            corners, A appearance dims, B photos of a step of all I, K sparse points, T sightings
 
 Where the printed paper is departed from, the line carries its tag:
   [D1]  alpha is divided by sigmoid(zeta s_prev) and never negative (printed: a wall is 63 % opaque)
@@ -30,23 +27,21 @@ Where the printed paper is departed from, the line carries its tag:
   [D3]  Phi uses NeuS-weighted errors, |lap| times eps, batch-quantile calibration, and is detached
   [D4]  the curvature loss is |lap| times eps: |lap| of a trilinear field grows as eps shrinks
   [D5]  the Lipschitz term is a sum of logs, not a product that can drown the colour at first
-  [D6]  CGNet: GroupNorm for BatchNorm, half the width, negative first bias, head at half resolution
+  [D6]  CGNet: GroupNorm, ReLU, half the width, negative first bias, head at half resolution
   [D7]  the mask pays mean M, not mean M^2, to go with an L1 error, above what SfM pixels err by
   [D8]  the background starts where the ray leaves the sphere and its last section is opaque
-  [D9]  the SDF branch stays in float32 under mixed precision: half precision makes noise of normals
+  [D9]  only colour networks run in half precision: it would make noise of distances and normals
   [D10] SfM points place the sphere, seed the octree, pull |s(p)| to zero and teach M = 0
   [D11] samples are drawn from a cached SDF volume; no second network pass along the ray
   [D12] test photos: appearance fitted on the left half, scored on the right half
-  [D13] exact normals by the trilinear weights, curvature where a ray ends; --normals fd: as printed
+  [D13] exact normals by trilinear weights (--normals fd: as printed); curvature where a ray ends
   [D14] the mask learns every few steps, by a logistic surrogate, from averaged errors of photos
 """
 from __future__ import annotations
 
-import argparse, contextlib, csv, datetime, difflib, functools, io, itertools, json, math, os
-import shutil, signal, subprocess, sys, threading, time
-from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass, field, fields
-from multiprocessing import get_context, parent_process
+import argparse, contextlib, datetime, functools, io, json, math, os, resource, shutil, signal
+import subprocess, sys, threading, time
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -60,7 +55,7 @@ from skimage.metrics import structural_similarity
 from torch import Tensor, nn
 
 import data_prep
-from data_prep import UserError, atomic_write, need
+from data_prep import UserError, atomic_write, need, tell
 
 torch.set_float32_matmul_precision("highest")  # [D9] no TF32, which some containers switch on
 
@@ -77,9 +72,6 @@ class Config:
 
     scene: str = opt("toy", "synthetic, or of Phototourism", "toy", *data_prep.SCENES)
     data: str = opt("", "an IMC-PT or COLMAP folder instead of a named scene")
-    method: str = opt("geonvsw", "which model to train", "geonvsw", "nerfw", "hanerf")
-    preset: str = opt("default", "quality against speed: see PRESETS", "fast", "default", "best")
-    tuned: bool = opt(False, "the method's settings that serve the toy best in a few minutes")
     name: str = opt("", "run folder below runs/ (default: scene-method-seed)")
     seed: int = opt(0, "seed of everything random")
     device: str = opt("auto", "auto, cpu, cuda or cuda:N")
@@ -92,17 +84,13 @@ class Config:
     bg_samples: int = opt(16, "background samples per ray")
     levels: int = opt(0, "octree levels, 0: from the pixel footprint at the surface")
     grid: str = opt("octree", "uniform: the same finest cell everywhere", "octree", "uniform")
-    split_error: float = opt(2.0, "times the lower quartile of all rays' errors splits a cell")
     max_mb: float = opt(1000.0, "memory up to which the foreground octree may grow, MiB")
-    bg_levels: int = opt(3, "octree levels of the background")
-    channels: int = opt(4, "feature channels per octree level")
     hidden: int = opt(64, "width of the MLPs")
     appearance_dim: int = opt(16, "length of a photo's appearance code")
     appearance: str = opt("auto", "codes; auto: on if exposures differ", "auto", "on", "off")
-    mask: str = opt("auto", "mask; auto: off if nothing is transient", "auto", "on", "off")
+    mask: str = opt("auto", "auto: off if nothing is transient; printed: as in the paper, without "
+                    "[D7] and [D14]", "auto", "on", "off", "printed")
     background: str = opt("auto", "field; auto: off if it is one colour", "auto", "on", "off")
-    mask_every: int = opt(4, "steps from one run of the mask network to the next [D14]")
-    mask_px: int = opt(96, "side of the square photo that the mask network sees, px")
     normals: str = opt("analytic", "derivatives of the SDF [D13]", "analytic", "fd")
     sampling: str = opt("cached", "how samples are placed [D11]", "cached", "uniform")
     alpha: str = opt("neus", "opacity of a section [D1] [D2]", "neus", "printed")
@@ -116,21 +104,14 @@ class Config:
     lam_off: float = opt(1e-3, "weight of the off-surface loss [R]")
     lam_sfm: float = opt(0.3, "weight of |s(p)| at SfM points [D10]")
     lam_mask: float = opt(0.04, "weight of mean M: the excess error that masks a pixel [D7]")
-    lam_bimodal: float = opt(1e-4, "weight of the pull of M to 0 and 1 (Ha-NeRF's digit loss) [R]")
     lr_grid: float = opt(1e-2, "learning rate of octree features")
     lr_net: float = opt(2e-3, "learning rate of networks and codes")
     lr_zeta: float = opt(1e-3, "learning rate of the deviation network")
-    curve: bool = opt(False, "record PSNR of held-out left halves over s and Wh, for --chart")
-    amp: str = opt("auto", "mixed precision; auto: on a GPU [D9]", "auto", "on", "off")
-    protocol: str = opt("half", "leaky: codes fitted on whole photos [D12]", "half", "leaky")
 
 
-LARGE = dict(steps=300_000, rays=4096, photos=16, samples=32, bg_samples=16, appearance_dim=32)
+LARGE = dict(steps=300_000, rays=4096, photos=16, samples=32, appearance_dim=32)
 # settings that differ from Config's defaults, by scene; flags override them
 SCENES = {"toy": dict(steps=3000), **{name: LARGE for name in data_prep.SCENES}}
-# factors on Geo-NVS-w's settings, from the front that --front measures: within a minute, steps of
-# half the rays win over those of more rays or samples; beyond it, steps are what is left to buy
-PRESETS = {"fast": dict(rays=0.5, steps=0.5), "default": {}, "best": dict(steps=3)}
 
 
 # ---- 2 Scene file and rays -----------------------------------------------------------------------
@@ -138,7 +119,7 @@ PRESETS = {"fast": dict(rays=0.5, steps=0.5), "default": {}, "best": dict(steps=
 class Scene(NamedTuple):
     """The arrays of a scene file (data_prep.py documents them) as tensors on the device."""
 
-    rgb: Tensor  # (N,3) uint8, all pixels of all photos; stays on the host if too large for a GPU
+    rgb: Tensor  # (N,3) uint8, all pixels of all photos
     start: Tensor  # (I+1,) first pixel of each photo
     wh: Tensor  # (I,2) width, height in px
     K: Tensor  # (I,4) fx fy cx cy in px
@@ -146,7 +127,10 @@ class Scene(NamedTuple):
     near: Tensor  # (I,) smallest useful t
     is_test: Tensor  # (I,)
     points: Tensor  # (K,3) SfM points
-    thumbs: Tensor  # (I,3,mask_px,mask_px) uint8, whole photos for the mask network
+    track_photo: Tensor  # (T,) a photo that shows
+    track_point: Tensor  # (T,) a point
+    track_uv: Tensor  # (T,2) at a place, over photo size, 0..1
+    thumbs: Tensor  # (I,3,n,n) uint8, whole photos for the mask network
     raw: dict  # the file in numpy: names, statistics, center, scale, ground truth of the toy
     info: dict
 
@@ -154,33 +138,19 @@ class Scene(NamedTuple):
         """Numbers (B,) of the held-out photos, or of those to train on."""
         return torch.nonzero(self.is_test == is_test)[:, 0]
 
-    def sightings(self) -> tuple[Tensor, Tensor, Tensor]:
-        """SfM points that photos show: photo (T,), point (T,3), its place on it (T,2) in 0..1."""
-        img, x = (torch.as_tensor(self.raw[f"track_{k}"]) for k in ("photo", "point"))  # (T,)
-        img, x = img.long().to(self.c2w.device), self.points[x.long()]  # (T,), (T,3)
-        local = ((x - self.c2w[img, :, 3])[:, None] @ self.c2w[img, :, :3])[:, 0]  # (T,3) camera
-        uv = local[:, :2] / local[:, 2:] * self.K[img, :2] + self.K[img, 2:]  # (T,2) px
-        uv = uv / self.wh[img]  # (T,2)
-        ok = (local[:, 2] > 0) & ((uv >= 0) & (uv < 1)).all(1)  # not those that SfM got wrong
-        return img[ok], x[ok], uv[ok]
 
-
-def load_scene(raw: dict, device="cpu", mask_px: int = 96) -> Scene:
-    """Scene from the dictionary of a scene file (data_prep.read_scene, make_toy or prepare)."""
+def load_scene(raw: dict, device="cpu") -> Scene:
+    """Scene from the dictionary of a scene file (data_prep.open_scene, make_toy or prepare)."""
     photos = [raw["rgb"][a:b].reshape(h, w, 3)
               for a, b, (w, h) in zip(raw["start"], raw["start"][1:], raw["wh"])]
-    thumbs = [cv2.resize(p, (mask_px, mask_px), interpolation=cv2.INTER_AREA) for p in photos]
+    side = int(np.clip(np.median(raw["wh"].max(1)) / 2, 96, 256))  # px that the mask network sees
+    thumbs = [cv2.resize(p, (side, side), interpolation=cv2.INTER_AREA) for p in photos]
     thumbs = torch.as_tensor(np.stack(thumbs)).permute(0, 3, 1, 2).contiguous().to(device)
-    kinds = dict(start=torch.long, wh=torch.long, is_test=torch.bool)
+    kinds = dict.fromkeys(("start", "wh", "track_photo", "track_point"), torch.long)
+    kinds |= dict(is_test=torch.bool, rgb=torch.uint8)
     arrays = {k: torch.as_tensor(raw[k]).to(device, kinds.get(k, torch.float32))
-              for k in Scene._fields[1:8]}
-    fits = thumbs.device.type == "cpu" or raw["rgb"].nbytes < torch.cuda.mem_get_info(device)[0] / 2
-    rgb = torch.as_tensor(raw["rgb"])
-    arrays["rgb"] = rgb.to(device) if fits else rgb.pin_memory()
+              for k in Scene._fields[:-3]}
     return Scene(**arrays, thumbs=thumbs, raw=raw, info=json.loads(str(raw["info"])))
-
-
-CHUNK = 4096  # rays or points evaluated at once outside training; more rays on a GPU
 
 
 class Rays(NamedTuple):
@@ -206,13 +176,12 @@ def pixel_directions(uv_px: Tensor, K: Tensor) -> Tensor:
 
 def make_rays(scene: Scene, img: Tensor, pixel: Tensor) -> Rays:
     """Rays through pixels. img, pixel: (R,) photo and row-major pixel number within it."""
-    w, h = scene.wh[img].unbind(1)  # (R,)
-    uv = torch.stack([pixel % w, pixel // w], 1) + 0.5  # (R,2) px
+    wh = scene.wh[img]  # (R,2)
+    uv = torch.stack([pixel % wh[:, 0], pixel // wh[:, 0]], 1) + 0.5  # (R,2) px
     c2w = scene.c2w[img]  # (R,3,4)
     d = (c2w[:, :, :3] @ pixel_directions(uv, scene.K[img])[:, :, None])[:, :, 0]  # (R,3)
-    at = (scene.start[img] + pixel).to(scene.rgb.device)  # (R,)
-    rgb = scene.rgb[at].to(d.device).float() / 255  # (R,3)
-    return Rays(c2w[:, :, 3], d, scene.near[img], img, uv / torch.stack([w, h], 1), rgb)
+    rgb = scene.rgb[scene.start[img] + pixel].float() / 255  # (R,3)
+    return Rays(c2w[:, :, 3], d, scene.near[img], img, uv / wh, rgb)
 
 
 def random_rays(scene: Scene, photos: Tensor, n: int, per_step: int, gen: torch.Generator):
@@ -221,7 +190,7 @@ def random_rays(scene: Scene, photos: Tensor, n: int, per_step: int, gen: torch.
     pick = photos[torch.randint(len(photos), (per_step,), generator=gen, device=dev)]  # (B,)
     img = pick.repeat_interleave(n // per_step)  # (R,) photo by photo, equally many from each
     u = torch.rand(len(img), generator=gen, device=dev, dtype=torch.float64)  # (R,)
-    return make_rays(scene, img, (u * (scene.start[img + 1] - scene.start[img])).long()), pick
+    return make_rays(scene, img, (u * scene.wh[img].prod(1)).long()), pick
 
 
 def sphere_interval(rays: Rays) -> tuple[Tensor, Tensor, Tensor]:
@@ -232,41 +201,9 @@ def sphere_interval(rays: Rays) -> tuple[Tensor, Tensor, Tensor]:
     disc = closest ** 2 - (rays.o ** 2).sum(1) + 1  # (R,)
     half = disc.clamp(min=0).sqrt()  # (R,)
     hit = (disc > 0) & (closest + half > rays.near)  # (R,)
-    t0 = torch.maximum(closest - half * hit, rays.near)  # (R,)
-    return t0, torch.maximum(closest + half * hit, t0), hit
-
-
-# torchrun starts RANKS processes. All draw the same random numbers and each works on own rows of a
-# step, so that together they do what one does; the first alone speaks, decides, scores and writes.
-RANK, LOCAL_RANK, RANKS = (int(os.environ.get(name, default)) for name, default in (
-    ("RANK", 0), ("LOCAL_RANK", 0), ("WORLD_SIZE", 1)))
-atomic_write = (lambda path, write: None) if RANK else atomic_write
-
-
-def agreed(value, source: int = 0):
-    """The value that one process has, for all of them."""
-    box = [value]
-    if RANKS > 1:
-        dist.broadcast_object_list(box, source)
-    return box[0]
-
-
-def in_shares(f, *rows) -> dict[str, Tensor]:
-    """f(*rows), from R rows to R rows by name: a process computes every RANKS-th, and all get all.
-    Gradients flow to own rows alone, RANKS-fold, as their mean over the processes is taken."""
-    if RANKS == 1:
-        return f(*rows)
-    own = f(*[Rays(*(v[RANK::RANKS] for v in r)) if isinstance(r, Rays) else r[RANK::RANKS]
-              for r in rows])
-    flat = torch.cat([v.reshape(len(v), -1) for v in own.values()], 1)  # (R/RANKS,columns)
-    flat.register_hook(lambda grad: RANKS * grad)
-    whole = flat.new_zeros(len(rows[-1]), flat.shape[1])  # (R,columns)
-    whole[RANK::RANKS] = flat.detach()
-    dist.all_reduce(whole)
-    whole[RANK::RANKS] = flat
-    parts = zip(own.items(), whole.split([v.shape[1:].numel() for v in own.values()], 1))
-    return {name: (part if v.requires_grad else part.detach()).reshape(-1, *v.shape[1:])
-            for (name, v), part in parts}
+    half = half * hit  # (R,)
+    t0 = torch.maximum(closest - half, rays.near)  # (R,)
+    return t0, torch.maximum(closest + half, t0), hit
 
 
 # ---- 3 Octree: features on the corners of cells --------------------------------------------------
@@ -277,6 +214,8 @@ CORNERS = torch.cartesian_prod(*[torch.arange(2)] * 3)  # (8,3), x slowest
 VALUE, SLOPE = torch.tensor([[[1.0, 0], [-1, 1]], [[-1, 1], [0, 0]]])  # (2,2) each, rows 1, f
 TRILINEAR = torch.cat([torch.kron(x, torch.kron(y, z)) for x, y, z in (
     3 * [VALUE], (SLOPE, VALUE, VALUE), (VALUE, SLOPE, VALUE), (VALUE, VALUE, SLOPE))], 1)
+PINNED = 64  # rows that stay zero, for hanging corners: on one row a GPU would queue their writes
+CHUNK = 4096  # points or rays evaluated at once outside training; more rays on a GPU
 
 
 @functools.cache
@@ -287,23 +226,23 @@ def resident(constant: Tensor, device: torch.device) -> Tensor:
 
 class Interpolate(torch.autograd.Function):
     """out[p,j] = sum over the 8 corners k of w[p,j,k] features[corner[p,k]], for J sets of weights:
-    of the value, and of its derivatives along x, y, z. Fused, as the hottest operation of a step.
-    Row 0 of the features belongs to the pinned corners: it is zero and gets no gradient."""
+    of the value, and of its derivatives along x, y, z. Fused: the hottest operation of a step."""
     @staticmethod
     def forward(ctx, features, corner, w):  # (V,C), (P,8), (P,J,8) -> (P,J,C)
         ctx.save_for_backward(corner, w)
         ctx.rows = len(features)
-        return torch.stack([F.embedding_bag(corner, features, per_sample_weights=wj.contiguous(),
-                                            mode="sum") for wj in w.unbind(1)], 1)
+        at = corner[:, None].expand(w.shape).reshape(-1, 8)  # (PJ,8)
+        out = F.embedding_bag(at, features, per_sample_weights=w.reshape(-1, 8), mode="sum")
+        return out.reshape(*w.shape[:2], features.shape[1])
 
     @staticmethod
     def backward(ctx, grad):  # (P,J,C)
         corner, w = ctx.saved_tensors
-        by_corner, is_single = w.transpose(1, 2), grad.shape[1] == 1  # (P,8,J)
-        spread = by_corner * grad if is_single else torch.bmm(by_corner, grad)  # (P,8,C)
+        by_corner = w.transpose(1, 2)  # (P,8,J)
+        spread = by_corner * grad if w.shape[1] == 1 else torch.bmm(by_corner, grad)  # (P,8,C)
         out = grad.new_zeros(ctx.rows, grad.shape[2])  # (V,C)
-        out.index_add_(0, corner.flatten().long(), spread.flatten(0, 1))
-        out[0] = 0
+        out.index_add_(0, corner.flatten(), spread.flatten(0, 1))
+        out[:PINNED] = 0  # hanging corners learn nothing
         return out, None, None
 
 
@@ -318,48 +257,39 @@ class Octree(nn.Module):
                  std: float = 1e-2):
         super().__init__()
         self.half, self.levels, self.root, self.std = half, levels, root, std
-        self.features = nn.Parameter(torch.zeros(1, channels, device=device))  # (V,C), row 0 pinned
-        key = torch.zeros(1, dtype=torch.long, device=device)
-        self.register_buffer("row_key", key)  # (V,) level and corner of each row
+        self.features = nn.Parameter(torch.zeros(PINNED, channels, device=device))  # (V,C)
+        self.register_buffer("row_key", torch.arange(PINNED, device=device))  # (V,) level, corner
         self.register_buffer("scale", root * 2.0 ** torch.arange(levels, device=device))  # (L,)
-        self.build([key[:0]] * (levels - 1))
-        self.features.data[1:].normal_(0, std)
-
-    def resolution(self, level: int) -> int:
-        return self.root << level
+        where = [(-1, (root * root, root, 1)), *[(1, (4, 2, 1))] * (levels - 1)]  # root, children
+        for name, value in zip(("bits", "stride"), zip(*where)):  # (L,1), (L,3)
+            value = torch.tensor(value, dtype=torch.int32, device=device).reshape(levels, -1)
+            self.register_buffer(name, value, persistent=False)
+        self.build([self.row_key[:0]] * (levels - 1))
+        self.features.data[PINNED:].normal_(0, std)
 
     def cell(self, level: int) -> float:
         """Side of a cell, scene units."""
-        return 2 * self.half / self.resolution(level)
-
-    def centres(self, level: int) -> Tensor:
-        """Centres (N,3) of the cells of a level."""
-        return (self.cells[level] + 0.5) * self.cell(level) - self.half
+        return 2 * self.half / (self.root << level)
 
     def key(self, ijk: Tensor, level: int) -> Tensor:
         """One number per cell or corner (...,3) of a level; corners run to resolution inclusive."""
-        n = self.resolution(level) + 1
+        n = (self.root << level) + 1
         return (ijk[..., 0] * n + ijk[..., 1]) * n + ijk[..., 2]
 
     def cell_of(self, x: Tensor, level: int) -> Tensor:
         """Integer coordinates (P,3) of the cells of a level that hold x (P,3), clamped."""
-        n = self.resolution(level)
+        n = self.root << level
         return ((x / (2 * self.half) + 0.5) * n).long().clamp(0, n - 1)
-
-    def around(self, ijk: Tensor, level: int) -> Tensor:
-        """Cells (P,3) of a level and all their neighbours, some repeatedly: (27P,3)."""
-        step = torch.cartesian_prod(*[torch.arange(-1, 2, device=ijk.device)] * 3)  # (27,3)
-        return (ijk[:, None] + step).reshape(-1, 3).clamp(0, self.resolution(level) - 1)
 
     def build(self, split_keys: list[Tensor]) -> Tensor:
         """Makes nodes and corners from the keys of the split cells of each level but the last. New
-        features are zero. Returns the former row (V,) of every row, 0 (the pinned one) if new."""
+        features are zero. Returns the former row (V,) of every row, 0 (a pinned one) if new."""
         octant = CORNERS.to(self.features.device)
         ijk = torch.cartesian_prod(*[torch.arange(self.root, device=octant.device)] * 3)  # (N,3)
-        child, corner, rows = [octant.new_zeros(8)], [octant.new_zeros(8, 8)], [octant.new_zeros(1)]
-        n_rows, n_nodes, self.split_keys, self.cells = 1, 8, [], []
+        child, corner, n_nodes = [octant.new_zeros(8)], [octant.new_zeros(8, 8)], 8
+        rows, n_rows, self.split_keys, self.cells = [self.row_key[:PINNED]], PINNED, [], []
         for level in range(self.levels):
-            n = self.resolution(level)
+            n = self.root << level
             self.cells.append(ijk)
             n_nodes += len(ijk)
             keys, inverse, count = torch.unique(
@@ -367,7 +297,8 @@ class Octree(nn.Module):
                 return_inverse=True, return_counts=True)
             at = torch.stack([keys // (n + 1) ** 2, keys // (n + 1), keys], 1) % (n + 1)  # corners
             free = count == 2 ** ((at > 0) & (at < n)).sum(1)  # all cells around it exist
-            corner.append(torch.where(free, n_rows - 1 + free.cumsum(0), 0)[inverse])  # (N,8)
+            row = torch.where(free, n_rows - 1 + free.cumsum(0), keys % PINNED)
+            corner.append(row[inverse])  # (N,8)
             rows.append(keys[free] + ((level + 1) << 40))
             n_rows += len(rows[-1])
             child.append(torch.zeros_like(ijk[:, 0]))  # (N,) first child
@@ -385,40 +316,32 @@ class Octree(nn.Module):
         self.active = sum(len(cells) > 0 for cells in self.cells)  # levels that have cells
         return old_row
 
-    def split(self, level: int, ijk: Tensor) -> Tensor:
+    def split(self, level: int, ijk: Tensor) -> None:
         """Splits cells ijk (P,3) of a level; the function stays, as new features are zero."""
         keys = list(self.split_keys)
         keys[level] = torch.cat([keys[level], self.key(ijk, level)])
-        return self.build(keys)
-
-    def prune(self, level: int, ijk: Tensor) -> Tensor:
-        """Removes the children of cells ijk (P,3) of a level, and all that hangs below them."""
-        keys = list(self.split_keys)
-        keys[level] = keys[level][~torch.isin(keys[level], self.key(ijk, level))]
-        return self.build(keys)
+        self.build(keys)
 
     def locate(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Corner rows (P,L,8) of the cells that hold x (P,3), and its place (P,L,3) 0..1 inside, on
         the levels that have cells."""
-        u = (x / (2 * self.half) + 0.5).clamp(0, 1 - 1e-6)  # (P,3)
+        u = (x / (2 * self.half) + 0.5).nan_to_num(0).clamp(0, 1 - 1e-6)  # (P,3)
         at = u[:, None] * self.scale[:self.active, None]  # (P,L,3) in cells
         ijk = at.int()  # (P,L,3)
-        bit = ijk & 1  # (P,L,3)
-        octant = bit[..., 0] * 4 + bit[..., 1] * 2 + bit[..., 2]  # (P,L)
-        nodes = [8 + (ijk[:, 0, 0] * self.root + ijk[:, 0, 1]) * self.root + ijk[:, 0, 2]]  # (P,)
+        step = ((ijk & self.bits[:self.active]) * self.stride[:self.active]).sum(2)  # (P,L)
+        nodes = [8 + step[:, 0]]  # (P,) root cell, then the child of the cell before
         for level in range(1, self.active):
-            nodes.append(self.child[nodes[-1]] + octant[:, level])  # (P,)
+            nodes.append(self.child[nodes[-1]] + step[:, level])  # (P,)
         return self.corner[torch.stack(nodes, 1)], at - ijk
 
     def forward(self, x: Tensor, derivatives: bool = False) -> Tensor:
         """Features (P,L,J,C) at x (P,3); J = 1, or 4: value, its change per cell along x, y, z."""
         P, L, J = len(x), self.active, 4 if derivatives else 1
         corner, inside = self.locate(x)  # (P,L,8), (P,L,3)
-        fx, fy, fz = inside.reshape(-1, 3).T.contiguous()  # (PL,)
-        yz = fy * fz
-        basis = torch.stack([torch.ones_like(fx), fz, fy, yz, fx, fx * fz, fx * fy, fx * yz], 1)
-        with torch.autocast(x.device.type, enabled=False):  # [D9] corners have float32 features
-            w = basis @ resident(TRILINEAR, x.device)[:, :8 * J]  # (PL,8) to (PL,8J)
+        one = torch.stack([torch.ones_like(inside), inside], 3).reshape(-1, 3, 2)  # (PL,3,2)
+        fx, fy, fz = one[:, 0, :, None, None], one[:, 1, :, None], one[:, 2, None]
+        basis = (fx * (fy * fz)[:, None]).reshape(-1, 8)  # (PL,8) 1 z y yz x xz xy xyz
+        w = basis @ resident(TRILINEAR, x.device)[:, :8 * J]  # (PL,8J)
         out = Interpolate.apply(self.features, corner.reshape(-1, 8), w.reshape(-1, J, 8))
         out = out.reshape(P, L, J, self.features.shape[1])
         return F.pad(out, (0, 0, 0, 0, 0, self.levels - L)) if L < self.levels else out
@@ -428,22 +351,58 @@ class Octree(nn.Module):
         return sum(t.numel() * t.element_size() for t in (self.features, self.child, self.corner))
 
 
-def seed_octree(octree: Octree, points: Tensor, dense: int, shell: tuple[float, float]) -> None:
-    """Splits all cells that touch the shell of radii up to level `dense`, then cells near points:
-    one cell on every side, so that the corners around a point are never hanging."""
+def seed_octree(octree: Octree, points: Tensor, dense: int) -> None:
+    """Splits all cells of the first `dense` levels, then of the next those near points (P,3) and
+    their neighbours, so that the corners around a point are never hanging. [D10]"""
     for level in range(min(dense, octree.levels - 1)):
-        reach = octree.cell(level) * math.sqrt(3) / 2
-        r = octree.centres(level).norm(dim=1)  # (N,)
-        touches = (r > shell[0] - reach) & (r < shell[1] + reach)  # (N,)
-        octree.split(level, octree.cells[level][touches])
-    if len(points) and dense < octree.levels - 1:
-        octree.split(dense, octree.around(octree.cell_of(points, dense), dense))
-    octree.features.data[1:].normal_(0, octree.std)
+        octree.split(level, octree.cells[level])
+    if dense < octree.levels - 1:
+        step = torch.cartesian_prod(*[torch.arange(-1, 2, device=points.device)] * 3)  # (27,3)
+        ijk = (octree.cell_of(points, dense)[:, None] + step).reshape(-1, 3)  # (27P,3)
+        octree.split(dense, ijk.clamp(0, (octree.root << dense) - 1))
+    octree.features.data[PINNED:].normal_(0, octree.std)
 
 
 def levels_for_footprint(footprint: float, root: int = 16, finest: int = 8) -> int:
     """Octree levels such that the finest cell is no smaller than a pixel at the surface."""
     return int(np.clip(1 + math.floor(math.log2(2 / footprint / root)), 2, finest))
+
+
+SPLIT_RAYS = 6  # recent rays that end in a cell before it is split
+SPLIT_ERROR = 2.0  # their mean error over the lower quartile of all rays' that splits it
+HIDDEN = 6.0  # zeta |s| from where on the field is not seen: sigmoid(-6) = 0.0025
+
+
+@torch.no_grad()
+def refined_keys(octree: Octree, sdf, hits: Tensor, zeta: float, max_mb: float) -> list[Tensor]:
+    """Split keys that fit the octree to the scene. sdf: (P,3) to (P,); hits (P,5): where recent
+    rays ended, their error, a pixel's size there; 2 where none was. Coarse levels come first, in
+    them the worst cells, as far as max_mb allows. A cell is split if it lies at the surface, enough
+    rays end in it, they miss their colour, and the children are not finer than its pixels. It is
+    merged again if nothing of it, nor within a child's side, where corners become pinned, is nearer
+    to the surface than HIDDEN / zeta: no pixel then changes by more than 2 sigmoid(-HIDDEN)."""
+    keys, hits = list(octree.split_keys), hits[hits[:, 4] != 2]  # (P,5)
+    bound = SPLIT_ERROR * hits[:, 3].sort()[0][len(hits) // 4:][:1]  # (1,), or (0,) without hits
+    hits = hits[hits[:, :3].norm(dim=1) < 1]  # (P,5) rays that miss the sphere split no cells
+    split_bytes = 8 * (36 + 4 * octree.features.shape[1])  # nodes, and as many corners
+    room = int(max(0, max_mb * 2 ** 20 - octree.bytes()) // split_bytes)
+    for level in range(min(octree.active, octree.levels - 1) if len(hits) else 0):
+        side, key = octree.cell(level), octree.key(octree.cells[level], level)  # (N,)
+        centre = (octree.cells[level] + 0.5) * side - octree.half  # (N,3)
+        s = torch.cat([sdf(x) for x in centre.split(CHUNK)]).abs()  # (N,)
+        reach = (math.sqrt(3) / 2 + 1) * side
+        keys[level] = keys[level][torch.isin(keys[level], key[s < reach + HIDDEN / zeta])]
+        hit, which, count = octree.key(octree.cell_of(hits[:, :3], level), level).unique(
+            return_inverse=True, return_counts=True)  # (Q,), (P,), (Q,)
+        mean = hits.new_zeros(len(hit), 2).index_add_(0, which, hits[:, 3:]) / count[:, None]
+        error, pixel = mean.unbind(1)  # (Q,)
+        pays = (count >= SPLIT_RAYS) & (error > bound) & (pixel < side / 2)  # (Q,)
+        pays &= torch.isin(hit, key[s < reach]) & ~torch.isin(hit, keys[level])
+        worst = error.argsort(descending=True)  # (Q,)
+        new = hit[worst[pays[worst]]][:room]
+        room -= len(new)
+        keys[level] = torch.cat([keys[level], new])
+    return keys
 
 
 # ---- 4 Fields: the networks on top of the octree -------------------------------------------------
@@ -453,56 +412,58 @@ BETA = 100.0  # sharpness of the SDF network's softplus: nearly a ReLU, but twic
 
 
 class SDFField(nn.Module):
-    """s(x) and a geometry feature, from xyz and octree features through one hidden layer. [D9]"""
+    """s(x) and what colour is read from: a geometry feature beside the octree's own features. One
+    hidden layer over xyz and features; G = GEO + L C. In float32 [D9]."""
     def __init__(self, octree: Octree, hidden: int):
         super().__init__()
-        self.octree = octree
-        self.lin1 = nn.Linear(3 + octree.features.shape[1] * octree.levels, hidden)
+        self.octree, self.features = octree, octree.features.shape[1] * octree.levels  # LC
+        self.lin1 = nn.Linear(3 + self.features, hidden)
         self.lin2 = nn.Linear(hidden, 1 + GEO)
 
-    def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """sdf (P,) and geometry feature (P,GEO) at x (P,3)."""
-        with torch.autocast(x.device.type, enabled=False):  # [D9]
-            z = torch.cat([x, self.octree(x).flatten(1)], 1)  # (P,3+LC)
-            out = self.lin2(F.softplus(self.lin1(z), BETA))  # (P,1+GEO)
-        return out[:, 0], out[:, 1:]
-
-    def with_gradient(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """sdf (P,), feature (P,GEO) and grad s (P,3) in closed form through the same corners. [D13]
+    def forward(self, x: Tensor, with_gradient: bool = False) -> tuple[Tensor, Tensor, Tensor]:
+        """sdf (P,), geometry (P,G) and, if wanted, grad s (P,3) at x (P,3), in closed form. [D13]
         The chain rule written out: ds/dx = ds/dz dz/dx with z = [x, features(x)]. It is an ordinary
         differentiable expression, so training through normals needs no second-order autograd."""
-        with torch.autocast(x.device.type, enabled=False):  # [D9]
-            feat = self.octree(x, derivatives=True)  # (P,L,4,C)
-            h = self.lin1(torch.cat([x, feat[:, :, 0].flatten(1)], 1))  # (P,H)
-            out = self.lin2(F.softplus(h, BETA))  # (P,1+GEO)
+        feat = self.octree(x, with_gradient)  # (P,L,1 or 4,C)
+        value, slope = feat.split([1, feat.shape[2] - 1], 2)  # (P,L,1,C), (P,L,0 or 3,C)
+        h = self.lin1(torch.cat([x, value.flatten(1)], 1))  # (P,H)
+        sdf, geo = self.lin2(F.softplus(h, BETA)).split([1, GEO], 1)  # (P,1), (P,GEO)
+        grad = None
+        if with_gradient:
             ds_dz = (torch.sigmoid(BETA * h) * self.lin2.weight[0]) @ self.lin1.weight  # (P,3+LC)
-            ds_df = ds_dz[:, None, None, 3:].reshape(feat[:, :, :1].shape)  # (P,L,1,C)
-            per_unit = (self.octree.scale / (2 * self.octree.half))[:, None, None]  # (L,1,1) cells
-            grad = ds_dz[:, :3] + (feat[:, :, 1:] * (ds_df * per_unit)).sum((1, 3))  # (P,3)
-        return out[:, 0], out[:, 1:], grad
+            ds_dx, ds_df = ds_dz.split([3, self.features], 1)  # (P,3), (P,LC)
+            per_unit = self.octree.scale[:, None, None] / (2 * self.octree.half)  # (L,1,1) cells
+            grad = ds_dx + (slope * (ds_df.reshape(value.shape) * per_unit)).sum((1, 3))  # (P,3)
+        return sdf.flatten(), torch.cat([geo, value.flatten(1)], 1), grad
 
 
-TETRAHEDRON = torch.tensor([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / math.sqrt(3)
+TAPS = F.pad(torch.tensor([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / math.sqrt(3),
+             (0, 0, 1, 0))  # (5,3) a point, and around it the ends of a tetrahedron
+MEAN = torch.tensor([-1, 0.25, 0.25, 0.25, 0.25])  # (5,) of the ends, less the point
 
 
-def finite_differences(sdf, x: Tensor, eps: float, centre: Tensor | None = None):
-    """Gradient (P,3) and Laplacian (P,) of sdf at x (P,3) from 4 tetrahedral taps (Neuralangelo).
-    Taps sit at x + eps k, |k| = 1: their mean difference to the centre is eps^2/6 times the
-    Laplacian, their k-weighted mean the gradient. centre: s(x) where the caller has it already."""
-    k = resident(TETRAHEDRON, x.device).to(x.dtype)  # (4,3)
-    ends = x[:, None] + eps * (k if centre is not None else F.pad(k, (0, 0, 0, 1)))  # (P,4 or 5,3)
-    s = sdf(ends.reshape(-1, 3)).reshape(len(x), -1)  # (P,4 or 5)
-    taps, centre = s[:, :4], s[:, 4] if centre is None else centre  # (P,4), (P,)
-    slope = (taps[:, :, None] * k).sum(1)  # (P,3) not taps @ k: autocast would round the taps [D9]
-    grad = 0.75 / eps * slope  # (P,3); sum over taps of k k^T is 4/3 times the identity
-    return grad, 6 / eps ** 2 * (taps.mean(1) - centre)  # (P,3), (P,)
+def taps(x: Tensor, eps: float) -> Tensor:
+    """Where finite_differences wants s around x (P,3): at x + eps k, |k| = 0 or 1. (P,5,3)"""
+    return x[:, None] + eps * resident(TAPS, x.device).to(x.dtype)
 
 
-def sh_basis(d: Tensor) -> Tensor:
-    """Real spherical harmonics up to degree 2 of unit directions (R,3) -> (R,9), no constants."""
-    x, y, z = d.unbind(1)
-    return torch.stack([torch.ones_like(x), x, y, z,
-                        x * y, y * z, z * x, x * x - y * y, 3 * z * z - 1], 1)  # (R,9)
+def finite_differences(s: Tensor, eps: float) -> tuple[Tensor, Tensor]:
+    """Gradient (P,3) and Laplacian (P,) from s (P,5) at the taps (Neuralangelo): the mean
+    difference to the centre is eps^2/6 times the Laplacian, the k-weighted mean the gradient."""
+    k, mean = (resident(c, s.device).to(s.dtype) for c in (TAPS, MEAN))  # (5,3), (5,)
+    return 0.75 / eps * (s @ k), 6 / eps ** 2 * (s @ mean)  # as sum k k^T is 4/3 of the identity
+
+
+def direction_basis(d: Tensor) -> Tensor:
+    """Polynomials up to degree 2 of unit directions (R,3): (R,9). They span what spherical
+    harmonics do, as x^2 + y^2 + z^2 is their constant."""
+    return torch.cat([d, d * d, d * d.roll(1, 1)], 1)
+
+
+def half_precision(x: Tensor):
+    """bfloat16 for the colour networks, on GPUs that have it. [D9]"""
+    has_it = x.is_cuda and torch.cuda.get_device_capability(x.device) >= (8, 0)
+    return torch.autocast(x.device.type, torch.bfloat16, enabled=has_it)
 
 
 class LipschitzMLP(nn.Module):
@@ -515,15 +476,17 @@ class LipschitzMLP(nn.Module):
 
     def bounds(self) -> Tensor:
         """Lipschitz bound of each layer in the max norm; above 0, as the loss takes its log."""
-        return F.softplus(self.c).clamp(min=1e-6)
+        return F.softplus(self.c) + 1e-6
 
     def forward(self, x: Tensor) -> Tensor:
-        for i, (layer, bound) in enumerate(zip(self.layers, self.bounds())):
-            norm = layer.weight.abs().sum(1).clamp(min=1e-9)  # (out,)
-            scale = (bound / norm).clamp(max=1)  # (out,)
-            x = F.relu(x) if i else x
-            x = F.linear(x, layer.weight * scale[:, None], layer.bias)  # (P,out)
-        return x
+        rows = [len(m.weight) for m in self.layers]
+        norm = torch.cat([torch.linalg.vector_norm(m.weight, 1, 1) for m in self.layers]) + 1e-9
+        bound = torch.cat([b.expand(n) for b, n in zip(self.bounds(), rows)])  # (rows,)
+        scale = (bound / norm).clamp(max=1)[:, None].split(rows)  # (out,1) of each layer
+        with half_precision(x):
+            for i, layer in enumerate(self.layers):
+                x = F.linear(F.relu(x) if i else x, layer.weight * scale[i], layer.bias)  # (P,out)
+        return x.float()
 
 
 def contract(x: Tensor) -> Tensor:
@@ -534,27 +497,30 @@ def contract(x: Tensor) -> Tensor:
 
 class Background(nn.Module):
     """A small NeRF outside the sphere, on an octree over contracted space."""
-    def __init__(self, octree: Octree, hidden: int, appearance_dim: int):
+    def __init__(self, octree: Octree, hidden: int, per_ray: int):
         super().__init__()
         self.octree = octree
         inputs = 3 + octree.features.shape[1] * octree.levels
         self.density, self.color = (
             nn.Sequential(nn.Linear(a, hidden), nn.ReLU(), nn.Linear(hidden, b))
-            for a, b in ((inputs, 1 + GEO), (GEO + 9 + appearance_dim, 3)))
+            for a, b in ((inputs, 1 + GEO), (GEO + per_ray, 3)))
 
-    def forward(self, rays: Rays, start: Tensor, code: Tensor, n: int, jitter: Tensor) -> Tensor:
-        """Colour (R,3) beyond start (R,). code: (R,A); jitter: (R,n) in 0..1. [D8] Sections are
-        equal steps of u in t = start + u / (1 - u); the last one is opaque."""
-        u = torch.arange(n, device=start.device) / n + jitter / n  # (R,n) stratified
-        t = start[:, None] + u / (1 - u).clamp(min=1e-3)  # (R,n)
-        x = contract(rays.at(t)).reshape(-1, 3)  # (Rn,3)
-        out = self.density(torch.cat([x, self.octree(x).flatten(1)], 1)).float()  # (Rn,1+GEO)
-        sigma = F.softplus(out[:, 0].reshape(len(t), n) - 1)  # (R,n)
-        alpha = 1 - torch.exp(-sigma[:, :-1] * torch.diff(t, dim=1))  # (R,n-1)
-        w, _ = composite(F.pad(alpha, (0, 1), value=1.0))  # (R,n)
-        per_ray = torch.cat([sh_basis(rays.d), code], 1).repeat_interleave(n, 0)  # (Rn,9+A)
-        rgb = torch.sigmoid(self.color(torch.cat([out[:, 1:], per_ray], 1)).float())  # (Rn,3)
-        return (w[:, :, None] * rgb.reshape(len(t), n, 3)).sum(1)  # (R,3)
+    def forward(self, rays: Rays, start: Tensor, per_ray: Tensor, jitter: Tensor) -> Tensor:
+        """Colour (R,3) beyond start (R,). per_ray: (R,9+A) direction and code; jitter: (R,S) in
+        0..1. [D8] Sections are equal steps of u in t = start + u / (1 - u); the last is opaque."""
+        R, S = jitter.shape
+        u = (torch.arange(S, device=start.device) + jitter) / S  # (R,S) stratified
+        t = start[:, None] + u / (1 - u).clamp(min=1e-3)  # (R,S)
+        x = contract(rays.at(t)).reshape(-1, 3)  # (RS,3)
+        feat = torch.cat([x, self.octree(x).flatten(1)], 1)  # (RS,3+LC)
+        with half_precision(x):
+            density, geo = self.density(feat).float().split([1, GEO], 1)  # (RS,1), (RS,GEO)
+            inputs = torch.cat([geo, per_ray.repeat_interleave(S, 0)], 1)  # (RS,GEO+9+A)
+            rgb = self.color(inputs).float().sigmoid().reshape(R, S, 3)  # (R,S,3)
+        sigma = F.softplus(density.reshape(R, S) - 1)[:, :-1]  # (R,S-1)
+        alpha = F.pad(-torch.expm1(-sigma * torch.diff(t)), (0, 1), value=1.0)  # (R,S)
+        w, _ = composite(alpha)  # (R,S)
+        return (w[:, :, None] * rgb).sum(1)  # (R,3)
 
 
 # ---- 5 From SDF to colour: sections along the ray, alpha, compositing ----------------------------
@@ -588,8 +554,9 @@ def printed_alpha(sdf: Tensor, cos: Tensor, dt: Tensor, zeta: Tensor) -> Tensor:
 def composite(alpha: Tensor) -> tuple[Tensor, Tensor]:
     """Weights w_i = T_i alpha_i (R,S), T_i = prod_{j<i} (1 - alpha_j); what passes, T (R,). Eq. 2
     The product runs as a sum of logs: its backward needs no look for zeros."""
-    trans = torch.exp(torch.log1p(-alpha.clamp(max=1 - 1e-6)).cumsum(1))  # (R,S) after each section
-    return F.pad(trans[:, :-1], (1, 0), value=1.0) * alpha, trans[:, -1]
+    passes = torch.log1p((1e-6 - 1) * alpha)  # (R,S) log of what passes a section
+    w = torch.exp(passes.cumsum(1) - passes) * alpha  # (R,S)
+    return w, 1 - w.sum(1)
 
 
 def inverse_cdf(edges: Tensor, weight: Tensor, u: Tensor) -> Tensor:
@@ -597,8 +564,8 @@ def inverse_cdf(edges: Tensor, weight: Tensor, u: Tensor) -> Tensor:
     cdf = torch.cumsum(weight, 1)
     cdf = F.pad(cdf / cdf[:, -1:], (1, 0))  # (R,N+1)
     hi = torch.searchsorted(cdf, u.contiguous(), right=True).clamp(1, weight.shape[1])  # (R,S)
-    c0, c1 = cdf.gather(1, hi - 1), cdf.gather(1, hi)  # (R,S)
-    e0, e1 = edges.gather(1, hi - 1), edges.gather(1, hi)  # (R,S)
+    both = torch.cat([hi - 1, hi], 1)  # (R,2S)
+    (c0, c1), (e0, e1) = cdf.gather(1, both).chunk(2, 1), edges.gather(1, both).chunk(2, 1)  # (R,S)
     return e0 + (e1 - e0) * ((u - c0) / (c1 - c0).clamp(min=1e-9)).clamp(0, 1)
 
 
@@ -606,74 +573,81 @@ PROBES = 64  # cheap lookups of the cached SDF per ray
 FLOOR = 0.2  # share of samples spread uniformly, so that a lost surface can return
 
 
-def cached_weight(cache: Tensor, rays: Rays, edges: Tensor, zeta: Tensor) -> Tensor:
-    """NeuS weights (R,N) of sections (R,N+1) from the cached SDF volume (1,1,n,n,n). [D11]"""
-    x = rays.at(edges).flip(-1)[None, None]  # (1,1,R,N+1,3) as grid_sample wants it, z first
-    s = F.grid_sample(cache, x, padding_mode="border", align_corners=True)[0, 0, 0]  # (R,N+1)
-    alpha = -torch.expm1(torch.diff(F.logsigmoid(zeta * s)).clamp(max=0))  # (R,N)
-    return composite(alpha)[0]
+class SDFCache(nn.Module):
+    """The SDF of the last steps on a dense grid: where along a ray samples pay. [D11]"""
+    def __init__(self, n: int):
+        super().__init__()
+        self.register_buffer("volume", torch.zeros(1, 1, n, n, n))  # x slowest
 
+    @torch.no_grad()
+    def refresh(self, sdf, part: int = 0, parts: int = 1) -> None:
+        """Evaluates sdf, (P,3) to (P,), again on every parts-th slice, from slice `part`."""
+        n = self.volume.shape[-1]
+        line = torch.linspace(-1, 1, n, device=self.volume.device)  # (n,)
+        x = torch.cartesian_prod(line[part::parts], line, line)  # (P,3)
+        size = 2 ** 18 if x.is_cuda else 2 ** 15  # launches bind a GPU, its cache a CPU
+        s = torch.cat([sdf(some) for some in x.split(size)])  # (P,)
+        self.volume[0, 0, part::parts] = s.reshape(-1, n, n)
 
-def sample_sections(model: "GeoNVS", rays: Rays, t0: Tensor, t1: Tensor, n: int, jitter: Tensor):
-    """Edges (R,n+1) of n sections from t0 to t1 (R,), dense where the cached SDF sees a surface.
-    jitter: (R,n) in 0..1, stratifies the n - 1 inner edges."""
-    u = (torch.arange(n - 1, device=t0.device) + jitter[:, :-1]) / (n - 1)  # (R,n-1)
-    probes = torch.linspace(0, 1, PROBES + 1, device=t0.device)  # (N+1,)
-    edges = t0[:, None] + (t1 - t0)[:, None] * probes  # (R,N+1)
-    weight = torch.ones_like(edges[:, 1:])  # (R,N)
-    if model.cfg.sampling == "cached":
-        zeta = model.deviation().clamp(max=model.cache.shape[-1])  # a surface as wide as a voxel
-        weight = cached_weight(model.cache, rays, edges, zeta)  # (R,N)
+    def weights(self, rays: Rays, edges: Tensor, zeta: Tensor) -> Tensor:
+        """NeuS weights (R,N) of sections (R,N+1), a surface being at least as wide as a voxel."""
+        x = rays.at(edges).flip(-1)[None, None]  # (1,1,R,N+1,3) as grid_sample wants it, z first
+        s = F.grid_sample(self.volume, x, padding_mode="border", align_corners=True)[0, 0, 0]
+        log_phi = F.logsigmoid(zeta.clamp(max=self.volume.shape[-1]) * s)  # (R,N+1)
+        return composite(-torch.expm1(torch.diff(log_phi).clamp(max=0)))[0]  # (R,N)
+
+    @torch.no_grad()
+    def edges(self, rays: Rays, t0: Tensor, t1: Tensor, jitter: Tensor, zeta: Tensor) -> Tensor:
+        """Edges (R,S+1) of S sections from t0 to t1 (R,), dense where a surface is seen; even ones
+        if zeta is 0. jitter: (R,S) in 0..1, stratifies the S - 1 inner edges."""
+        n, t0, t1 = jitter.shape[1] - 1, t0[:, None], t1[:, None]  # (R,1)
+        u = (torch.arange(n, device=t0.device) + jitter[:, :n]) / n  # (R,S-1)
+        probes = torch.lerp(t0, t1, torch.linspace(0, 1, PROBES + 1, device=t0.device))  # (R,N+1)
+        weight = self.weights(rays, probes, zeta)  # (R,N)
         weight = weight + (FLOOR / (1 - FLOOR) * weight.sum(1, keepdim=True) + 1e-3) / PROBES
-    return torch.cat([t0[:, None], inverse_cdf(edges, weight, u), t1[:, None]], 1)  # (R,n+1)
+        return torch.cat([t0, inverse_cdf(probes, weight, u), t1], 1)  # (R,S+1)
 
 
 def render_rays(model: "GeoNVS", rays: Rays, code: Tensor, jitter: Tensor) -> dict[str, Tensor]:
-    """One ray batch through the whole model. code: (R,A) appearance; jitter: (R,S+B) in 0..1.
-    Returns rgb (R,3), opacity, depth (R,), normal (R,3), e_grad, e_curv (R,): eikonal error and
-    curvature of Eq. 4, NeuS-weighted [D3] (analytic normals: curvature where the ray ends); hit
-    (R,), the rays' ends x (R,3), eikonal error of each sample (R,S)."""
-    cfg, R, S = model.cfg, len(rays.o), model.cfg.samples
+    """One ray batch through the whole model. code: (R,A) appearance; jitter: (R,S+B) in 0..1, for
+    the B background samples too. Returns rgb (R,3), eikonal error of each sample (R,S), and without
+    gradient hit, opacity, depth (R,), normal, the ray's end x (R,3), E_grad of Eq. 4 (R,)."""
+    cfg, R, S, zeta = model.cfg, len(rays.o), model.cfg.samples, model.deviation()
     t0, t1, hit = sphere_interval(rays)  # (R,)
-    with torch.no_grad():
-        edges = sample_sections(model, rays, t0, t1, S, jitter[:, :S])  # (R,S+1)
+    seen_zeta = zeta if cfg.sampling == "cached" else 0 * zeta  # 0: nothing is seen, even sections
+    edges = model.cache.edges(rays, t0, t1, jitter[:, :S], seen_zeta)  # (R,S+1)
     t = (edges[:, 1:] + edges[:, :-1]) / 2  # (R,S)
     x = rays.at(t).reshape(-1, 3)  # (RS,3)
+    sdf, geo, grad = model.sdf(x, cfg.normals == "analytic")  # (RS,), (RS,G), (RS,3) [D13]
     if cfg.normals == "fd":
-        sdf, geo = model.sdf(x)  # (RS,), (RS,GEO)
-        grad, lap = finite_differences(lambda y: model.sdf(y)[0], x, model.eps, sdf)  # (RS,3)
-    else:
-        sdf, geo, grad = model.sdf.with_gradient(x)  # (RS,), (RS,GEO), (RS,3) [D13]
-    normal = F.normalize(grad, dim=1)  # (RS,3)
+        s = model.distance(taps(x, model.eps).reshape(-1, 3)).reshape(-1, 5)  # (RS,5)
+        grad, _ = finite_differences(s, model.eps)  # (RS,3)
+    length = grad.norm(dim=1, keepdim=True)  # (RS,1)
+    normal = grad / (length + 1e-12)  # (RS,3)
     cos = (grad.reshape(R, S, 3) * rays.d[:, None]).sum(2)  # (R,S)
     opacity_of = neus_alpha if cfg.alpha == "neus" else printed_alpha
-    alpha = opacity_of(sdf.reshape(R, S), cos, torch.diff(edges), model.deviation())  # (R,S)
+    alpha = opacity_of(sdf.reshape(R, S), cos, torch.diff(edges), zeta)  # (R,S)
     w, trans = composite(alpha * hit[:, None])  # (R,S), (R,)
-    per_ray = torch.cat([sh_basis(rays.d), code], 1)[:, None].expand(R, S, -1).reshape(R * S, -1)
-    rgb_s = torch.sigmoid(model.color(torch.cat([geo, normal, per_ray], 1)).float())  # (RS,3)
-    rgb = (w[:, :, None] * rgb_s.reshape(R, S, 3)).sum(1)  # (R,3)
+    per_ray = torch.cat([direction_basis(rays.d), code], 1)  # (R,9+A)
+    inputs = torch.cat([geo, normal, per_ray.repeat_interleave(S, 0)], 1)  # (RS,G+3+9+A)
+    rgb = (w[:, :, None] * model.color(inputs).sigmoid().reshape(R, S, 3)).sum(1)  # (R,3)
     behind = model.bg_color  # (3,)
     if model.background is not None:
-        behind = model.background(rays, t1, code, cfg.bg_samples, jitter[:, S:])  # (R,3)
-    opacity = w.sum(1)  # (R,)
-    depth = (w * t).sum(1) + trans * t1  # (R,)
-    end = rays.o + depth.detach()[:, None] * rays.d  # (R,3) where the ray ends
-    if cfg.normals == "fd":
-        e_curv = (w.detach() * lap.reshape(R, S).abs()).sum(1) * model.eps  # (R,)
-    else:  # four taps where the ray ends, for the curvature alone
-        _, lap = finite_differences(lambda y: model.sdf(y)[0], end, model.eps)  # (R,)
-        e_curv = lap.abs() * model.eps * opacity.detach()  # (R,) flat, not transparent
-    error = ((grad.norm(dim=1) - 1) ** 2).reshape(R, S)
-    return dict(rgb=rgb + trans[:, None] * behind, opacity=opacity, depth=depth, hit=hit, x=end,
-                normal=(w[:, :, None] * normal.reshape(R, S, 3)).sum(1),
-                e_curv=e_curv, e_grad=(w * error).sum(1), eikonal=error)
+        behind = model.background(rays, t1, per_ray, jitter[:, S:])  # (R,3)
+    eikonal = ((length - 1) ** 2).reshape(R, S)
+    with torch.no_grad():
+        depth = (w * t).sum(1) + trans * t1  # (R,)
+        seen = dict(opacity=1 - trans, depth=depth, x=rays.o + depth[:, None] * rays.d, hit=hit,
+                    normal=(w[:, :, None] * normal.reshape(R, S, 3)).sum(1),
+                    e_grad=(w * eikonal).sum(1))  # NeuS-weighted [D3]
+    return seen | dict(rgb=rgb + trans[:, None] * behind, eikonal=eikonal)
 
 
 # ---- 6 Photos in the wild: transient mask and geometry preservation ------------------------------
 
 def conv(cin: int, cout: int, size: int = 3, stride: int = 1) -> nn.Sequential:
     return nn.Sequential(nn.Conv2d(cin, cout, size, stride, size // 2, bias=False),
-                         nn.GroupNorm(8, cout), nn.PReLU(cout))  # [D6]
+                         nn.GroupNorm(8, cout), nn.ReLU())  # [D6]
 
 
 class ContextBlock(nn.Module):
@@ -684,7 +658,7 @@ class ContextBlock(nn.Module):
         self.reduce = conv(cin, half, 3 if stride == 2 else 1, stride)
         self.local = nn.Conv2d(half, half, 3, 1, 1, groups=half, bias=False)
         self.around = nn.Conv2d(half, half, 3, 1, dilation, dilation, half, bias=False)
-        self.join = nn.Sequential(nn.GroupNorm(8, cout), nn.PReLU(cout))
+        self.join = nn.Sequential(nn.GroupNorm(8, cout), nn.ReLU())
         self.gate = nn.Sequential(nn.Linear(cout, cout // 8), nn.ReLU(),
                                   nn.Linear(cout // 8, cout), nn.Sigmoid())
 
@@ -701,19 +675,21 @@ class CGNet(nn.Module):
     def __init__(self, width: int = 16):
         super().__init__()
         a, b, c = width, 2 * width, 4 * width
-        self.stem = nn.Sequential(conv(3, a, stride=2), conv(a, a))
-        self.stage2 = nn.Sequential(ContextBlock(a, b, 2, 2), ContextBlock(b, b, 1, 2))
-        self.stage3 = nn.Sequential(ContextBlock(b, c, 2, 4), ContextBlock(c, c, 1, 4))
+        self.stages = nn.ModuleList([
+            nn.Sequential(conv(3, a, stride=2), conv(a, a)),
+            nn.Sequential(ContextBlock(a, b, 2, 2), ContextBlock(b, b, 1, 2)),
+            nn.Sequential(ContextBlock(b, c, 2, 4), ContextBlock(c, c, 1, 4))])
         self.heads = nn.ModuleList(nn.Conv2d(k, 1, 1) for k in (a, b, c))
         for head, bias in zip(self.heads, (-2.5, 0.0, 0.0)):
             nn.init.constant_(head.bias, bias)  # starts with 8 % masked, not with half the picture
 
     def forward(self, photo: Tensor) -> Tensor:
-        y1 = self.stem(photo - 0.5)  # (B,a,H/2,W/2)
-        y2 = self.stage2(y1)  # (B,b,H/4,W/4)
-        y3 = self.stage3(y2)  # (B,c,H/8,W/8)
-        return sum(F.interpolate(head(y).float(), y1.shape[2:], mode="bilinear")
-                   for head, y in zip(self.heads, (y1, y2, y3)))  # (B,1,H/2,W/2)
+        y, logits = photo - 0.5, []
+        for stage, head in zip(self.stages, self.heads):
+            y = stage(y)  # (B,a,H/2,W/2), (B,b,H/4,W/4), (B,c,H/8,W/8)
+            logits.append(head(y))
+        size = logits[0].shape[2:]
+        return sum(F.interpolate(z, size, mode="bilinear") for z in logits)  # (B,1,H/2,W/2)
 
 
 def mask_at(logits: Tensor, uv: Tensor) -> Tensor:
@@ -723,23 +699,11 @@ def mask_at(logits: Tensor, uv: Tensor) -> Tensor:
     return torch.sigmoid(at).flatten()  # (R,)
 
 
-def edge_indicator(e_grad: Tensor, e_curv: Tensor, lam_grad: float, lam_lap: float,
-                   calibration: Tensor | None) -> Tensor:
-    """Phi (R,) from the rays' eikonal error and curvature. Eq. 4 calibration (2,): centre and width
-    of the sigmoid. None is the literal reading: Phi then lies between 0.5 and 1 for every ray, a
-    price that tells no edge. Detached [D3]: it is to hold back the mask, not to smooth geometry."""
-    x = (lam_grad * e_grad + lam_lap * e_curv).detach()  # (R,)
-    return torch.sigmoid(x if calibration is None else (x - calibration[0]) / calibration[1])
-
-
-QUANTILES = torch.tensor([0.5, 0.75, 0.95])
-
-
-def calibrate(x: Tensor, calibration: Tensor, rate: float = 0.05) -> None:
-    """Moves calibration (2,) to the batch's: 75th percentile and width (p95 - p50) / 4. [D3]"""
-    x = x.detach().nan_to_num(0, 0, 0)  # (R,)
-    p50, p75, p95 = x.quantile(resident(QUANTILES, x.device))
-    calibration.lerp_(torch.stack([p75, ((p95 - p50) / 4).clamp(min=1e-3)]), rate)
+def edge_indicator(bend: Tensor, calibration: Tensor | None) -> Tensor:
+    """Phi of bend = lambda_grad E_grad + lambda_curv E_curv, any shape. Eq. 4 calibration (2,):
+    centre and width of the sigmoid [D3]. None is the literal reading: Phi then lies between 0.5 and
+    1 for every ray, a price that tells no edge."""
+    return torch.sigmoid(bend if calibration is None else (bend - calibration[0]) / calibration[1])
 
 
 def gpl_loss(mask: Tensor, edge: Tensor) -> Tensor:
@@ -747,12 +711,85 @@ def gpl_loss(mask: Tensor, edge: Tensor) -> Tensor:
     return (mask * edge).mean()
 
 
-# ---- 7 The model and its objective ---------------------------------------------------------------
-
 def bimodality(mask: Tensor) -> Tensor:
     """The second half of L_reg: a pole at 1/2 that pushes M to 0 or 1 (Ha-NeRF's digit loss)."""
     return (1 / ((mask - 0.5) ** 2 + 0.02)).mean()
 
+
+MASK_EVERY = 8  # steps from one lesson of the mask network to the next [D14]
+LAM_BIMODAL = 1e-4  # weight of bimodality beside mean M, above which masks freeze half-way
+
+
+class TransientMask(nn.Module):
+    """M, which pixels show what passes by: CGNet, what rays last found at each pixel of each photo,
+    and the objective that it learns from. m: side of the logits, px."""
+    def __init__(self, cfg: Config, scene: Scene):
+        super().__init__()
+        self.cfg, self.thumbs, self.is_on = cfg, scene.thumbs, cfg.mask != "off"
+        self.cgnet, I, m = CGNet(), len(scene.thumbs), (scene.thumbs.shape[3] + 1) // 2
+        static = torch.zeros(I, 1, m, m, dtype=torch.bool, device=scene.thumbs.device)
+        ok = ((scene.track_uv >= 0) & (scene.track_uv < 1)).all(1)  # not those that SfM got wrong
+        col, row = (scene.track_uv[ok] * m).long().unbind(1)  # (T,)
+        static[scene.track_photo[ok], 0, row, col] = True
+        for name, value in dict(
+                logits=torch.full((I, 1, m, m), -9.0),  # last output of the network
+                seen=torch.full((I, 5, m, m), -1.0),  # last residual, bend, opacity; -1: no ray yet
+                calibration=torch.tensor([0.0, 1.0]),  # centre and width of Phi
+                static=static,  # pixels that show an SfM point, but for outlines scene [D10]
+                usual=torch.tensor(0.3)).items():  # running upper quartile of such pixels' errors
+            self.register_buffer(name, value)
+
+    def look(self, pick: Tensor) -> Tensor:
+        """Logits (B,1,m,m) of photos (B,)."""
+        return self.cgnet(self.thumbs[pick].float() / 255)
+
+    def remember(self, rays: Rays, residual: Tensor, bend: Tensor, opacity: Tensor) -> None:
+        """Keeps residual (R,3), bend and opacity (R,) where the network will look for them."""
+        m = self.seen.shape[-1]
+        col, row = (rays.uv * m).long().clamp(max=m - 1).unbind(1)  # (R,)
+        found = torch.cat([residual, bend[:, None], opacity[:, None]], 1)  # (R,5)
+        self.seen[rays.img, :, row, col] = found.nan_to_num(0, 0, 0)
+
+    def calibrate(self, bend: Tensor, rate: float = 0.2) -> None:
+        """Moves Phi's centre and width to the rays': p75 and (p95 - p50) / 4 of bend (R,). [D3]"""
+        order, last = bend.nan_to_num(0, 0, 0).sort()[0], len(bend) - 1  # (R,)
+        p50, p75, p95 = (order[int(q * last)] for q in (0.5, 0.75, 0.95))
+        self.calibration.lerp_(torch.stack([p75, ((p95 - p50) / 4).clamp(min=1e-3)]), rate)
+
+    def phi(self, pick: Tensor) -> Tensor:
+        """Phi times opacity (B,1,m,m) of photos (B,) as rays found it; 0 where none came."""
+        bend, opacity = self.seen[pick, 3:].split(1, 1)  # (B,1,m,m)
+        calibration = self.calibration if self.cfg.gpl == "calibrated" else None
+        return opacity.clamp(min=0) * edge_indicator(bend, calibration)
+
+    def objective(self, pick: Tensor) -> tuple[Tensor, Tensor]:
+        """The terms of Eq. 5 that hold M, over all pixels of photos (B,) that rays have seen, and
+        L_GPL alone. [D14] Eq. 5 is linear in M: M = 1 costs a pixel its intensity and GPL and saves
+        it its error. As a sigmoid hardly moves at 0 or 1, price times M is minimised through its
+        logistic surrogate: the same sign, so the same optimum, but a slope that never vanishes.
+        Errors are signed means over 3x3 pixels, of the worst channel: what a blurred model lacks
+        cancels, people do not. Pixels that show SfM points are scene: their own error never counts
+        for M = 1, but tells what is usual. The price lies above: at first, and in fine detail, the
+        scene is wrong. --mask printed has none of this: mean M^2 is the price of saved errors."""
+        cfg, logits, phi = self.cfg, self.look(pick), self.phi(pick)  # (B,1,m,m)
+        self.logits[pick] = logits.detach()
+        residual, known = self.seen[pick, :3], (self.seen[pick, 4:] >= 0).float()  # (B,3 or 1,m,m)
+        mask, static = logits.sigmoid(), self.static[pick]  # (B,1,m,m)
+        gpl, pole = gpl_loss(mask, phi), LAM_BIMODAL * bimodality(mask)
+        if cfg.mask == "printed":
+            error = residual.abs().mean(1, keepdim=True)  # (B,1,m,m)
+            paid = ((1 - mask) * error + cfg.lam_mask * mask ** 2) * known  # (B,1,m,m)
+            return paid.mean() + pole + cfg.lam_gpl * gpl, gpl.detach()
+        around = F.avg_pool2d(torch.cat([residual * known, known], 1), 3, 1, 1)  # (B,4,m,m)
+        error = (around[:, :3] / around[:, 3:].clamp(min=0.1)).abs().amax(1, True)  # (B,1,m,m)
+        usual = torch.where(static & (known > 0), error, math.nan).nanquantile(0.75)
+        self.usual.lerp_(torch.where(usual.isnan(), self.usual, usual), 0.1)
+        price = cfg.lam_mask + self.usual + cfg.lam_gpl * phi - error * ~static  # (B,1,m,m) [D7]
+        slope = F.softplus(torch.where(price > 0, logits, -logits))  # (B,1,m,m)
+        return (price.abs() * slope * known).mean() + pole, gpl.detach()
+
+
+# ---- 7 The model and its objective ---------------------------------------------------------------
 
 def random_ball(n: int, gen: torch.Generator) -> Tensor:
     """Uniform points (n,3) in the unit ball."""
@@ -760,282 +797,160 @@ def random_ball(n: int, gen: torch.Generator) -> Tensor:
     return direction * torch.rand(n, 1, generator=gen, device=gen.device) ** (1 / 3)
 
 
-class Method(nn.Module):
-    """What the training loop asks of a method, with the answers that most of them give."""
+def octrees_of(model: nn.Module) -> list[Octree]:
+    return [part for part in model.modules() if isinstance(part, Octree)]
 
-    step = 0  # number of the present step, set by the loop
+
+BG_LEVELS = 3  # octree levels of the background
+TERMS = ("rgb", "eik", "curv", "lps", "off", "sfm")  # of Eq. 5; those that hold M: section 6
+
+
+class GeoNVS(nn.Module):
+    """The paper's model: it assembles the parts above and sums their losses. What stands from
+    `losses` on is what training and scoring ask of any model; rivals in the tests answer too."""
+
+    name = "geonvsw"
     adam = dict(betas=(0.9, 0.99), eps=1e-15)  # as is usual for feature grids (Instant-NGP)
 
-    def octrees(self) -> list[Octree]:
-        return [part for part in self.modules() if isinstance(part, Octree)]
-
-    def codes(self) -> Tensor:
-        """Appearance codes (I,A) of all photos."""
-        return self.appearance.weight
-
-    def start(self, gen: torch.Generator) -> None:
-        """Before the first step."""
-
-    def batch(self, photos: Tensor, gen: torch.Generator) -> tuple[Rays, Tensor]:
-        """Rays of one step and the photos (B,) they come from."""
-        return random_rays(self.scene, photos, self.cfg.rays, self.cfg.photos, gen)
-
-    def maintain(self, step: int, progress: float, optimizer: torch.optim.Optimizer) -> None:
-        """After every step."""
-
-    def health(self) -> dict[str, Tensor]:
-        """More figures for a line of the log."""
-        return {}
-
-
-REFINE_AT = (0.1, 0.2, 0.3, 0.45, 0.6)  # shares of training at which the octree is refined
-SPLIT_RAYS = 6  # recent rays that end in a cell before it is split
-HIDDEN = 6.0  # zeta |s| from where on the field is not seen: sigmoid(-6) = 0.0025
-
-
-def worth_splitting(octree: Octree, level: int, hits: Tensor, bound: float) -> Tensor:
-    """Keys (Q,) of cells where enough rays end, that miss their colour by more than bound on
-    average, and to whose pixels the children are not too fine; worst first. hits: (P,5), the rays'
-    ends, errors and pixel sizes there."""
-    key, which, count = octree.key(octree.cell_of(hits[:, :3], level), level).unique(
-        return_inverse=True, return_counts=True)  # (Q,), (P,), (Q,)
-    mean = hits.new_zeros(len(key), 2).index_add_(0, which, hits[:, 3:]) / count[:, None]  # (Q,2)
-    error, pixel = mean.unbind(1)  # (Q,)
-    pays = (count >= SPLIT_RAYS) & (error > bound) & (pixel < octree.cell(level) / 2)  # (Q,)
-    worst = error.argsort(descending=True)
-    return key[worst[pays[worst]]]
-
-
-class GeoNVS(Method):
-    """The paper's model: what it learns, and what it caches to be fast."""
     def __init__(self, cfg: Config, scene: Scene):
         super().__init__()
-        self.cfg, self.scene, self.refined = cfg, scene, 0
-        self.use_mask, dev = cfg.mask != "off", scene.c2w.device
+        self.cfg, self.scene, raw, dev = cfg, scene, scene.raw, scene.c2w.device
         inside = scene.points.norm(dim=1) < 1
         self.sfm = scene.points[inside]  # (K,3)
-        levels = cfg.levels or levels_for_footprint(float(scene.raw["footprint"]))
+        levels = cfg.levels or levels_for_footprint(float(raw["footprint"]))
+        octree = Octree(1.0, levels, device=dev)
         is_octree = len(self.sfm) > 0 and cfg.grid == "octree"
-        if not is_octree:  # a dense cube has 8/7 of its finest cells, as many corners
-            side = (7 / 8 * cfg.max_mb * 2 ** 20 / (36 + 4 * cfg.channels)) ** (1 / 3)  # in cells
-            levels = max(1, min(levels, 1 + int(math.log2(max(side / 16, 1)))))
-        octree = Octree(1.0, levels, cfg.channels, dev)
-        dense, radius = (1, 1.0) if is_octree else (levels, math.sqrt(3))
-        seed_octree(octree, self.sfm, dense, (0.0, radius))  # [D10]
-        spread, sky = float(scene.raw["exposure_spread"]), torch.as_tensor(scene.raw["bg_color"])
-        has_codes = cfg.appearance == "on" or cfg.appearance == "auto" and spread > 0.01
-        A = cfg.appearance_dim * has_codes
+        seed_octree(octree, self.sfm, 1 if is_octree else levels - 1)
+        has_codes = dict(on=True, off=False, auto=raw["exposure_spread"] > 0.01)[cfg.appearance]
+        has_field = dict(on=True, off=False, auto=np.isnan(raw["bg_color"]).any())[cfg.background]
+        A = cfg.appearance_dim if has_codes else 0
         self.sdf = SDFField(octree, cfg.hidden)
         self.appearance = nn.Embedding(len(scene.wh), A).requires_grad_(A > 0)  # at 0 CUDA errs
         nn.init.normal_(self.appearance.weight, std=0.01)
-        self.color = LipschitzMLP([GEO + 3 + 9 + A, cfg.hidden, cfg.hidden, 3])
+        self.color = LipschitzMLP([GEO + self.sdf.features + 3 + 9 + A, cfg.hidden, cfg.hidden, 3])
         self.background = None
-        if cfg.background == "on" or cfg.background == "auto" and sky.isnan().any():
-            outer = Octree(2.0, cfg.bg_levels, cfg.channels, dev)
-            seed_octree(outer, contract(scene.points[~inside]), 1, (1.0, 2.0))
-            self.background = Background(outer, cfg.hidden, A)
-        self.deviation, self.cgnet = Deviation(), CGNet()
-        I, m = len(scene.wh), (cfg.mask_px + 1) // 2
-        n = np.clip(octree.resolution(levels - 1), 64, 128)
-        static = torch.zeros(I, 1, m, m, dtype=torch.bool, device=dev)
-        img, x, uv = scene.sightings()  # (T,), (T,3), (T,2)
-        col, row = (uv * m).long().unbind(1)  # (T,)
-        static[img, 0, row, col] = True
-        pick = torch.nonzero(~scene.is_test[img] & (x.norm(dim=1) < 0.95))[:, 0]
-        pick = pick[::max(1, len(pick) // 256)]
-        self.probes = img[pick], x[pick]  # (Q,), (Q,3) for health
-        memory = dict(
-            bg_color=sky.float().nan_to_num(0.5), calibration=torch.tensor([0.0, 1.0]),
-            level=torch.tensor(0.1),  # running lower quartile of all L1 errors, for splits
-            cache=torch.zeros(1, 1, n, n, n),  # SDF on a dense grid, for placing samples [D11]
-            hits=torch.full((max(2 ** 18, 512 * cfg.rays), 5), 2.0),  # ends of rays, errors, pixels
-            logits=torch.full((I, 1, m, m), -9.0),  # last output of the mask network
-            seen=torch.full((I, 4, m, m), -1.0),  # last residual and Phi by pixel; -1: no ray yet
-            static=static,  # pixels that show an SfM point, but for outlines scene [D10]
-            usual=torch.tensor(0.3))  # running upper quartile of the errors of such pixels
-        for name, value in memory.items():
+        if has_field:
+            outer = Octree(2.0, BG_LEVELS, device=dev)
+            seed_octree(outer, contract(scene.points[~inside]), 1)
+            self.background = Background(outer, cfg.hidden, 9 + A)
+        self.deviation, self.mask = Deviation(), TransientMask(cfg, scene)
+        self.cache = SDFCache(int(np.clip(octree.root << levels - 1, 64, 128)))
+        for name, value in dict(
+                bg_color=torch.as_tensor(raw["bg_color"]).float().nan_to_num(0.5),
+                hits=torch.full((512 * cfg.rays, 5), 2.0)).items():  # what refined_keys looks at
             self.register_buffer(name, value)
+        lam = torch.tensor([1.0, *(getattr(cfg, f"lam_{k}") for k in TERMS[1:])])
+        self.register_buffer("lam", lam, persistent=False)  # flags may change it
         self.to(dev)
+        print(f"  {levels} levels, finest cell {octree.cell(levels - 1):.4f}; appearance {A} "
+              f"numbers; background {'a field' if has_field else 'one colour'}; mask {cfg.mask}")
 
     @property
     def eps(self) -> float:
         """Length of the taps of finite differences: half of the finest cell there is."""
         return self.sdf.octree.cell(self.sdf.octree.active - 1) / 2
 
-    def get_extra_state(self) -> dict:
-        return dict(refined=self.refined, use_mask=self.use_mask)
+    def distance(self, x: Tensor) -> Tensor:
+        """s (P,) at x (P,3)."""
+        return self.sdf(x)[0]
 
-    def set_extra_state(self, state: dict) -> None:
-        self.refined = state["refined"]
-        self.use_mask = state["use_mask"] if self.cfg.mask == "auto" else self.use_mask
+    def losses(self, rays: Rays, pick: Tensor, step: int, gen: torch.Generator):
+        """The objective, Eq. 5: its weighted sum, and the raw terms by name. M is held fixed, but
+        for every few steps, when the terms that teach it are added [D14]. pick: photos (B,)."""
+        cfg, R, n = self.cfg, len(rays.o), len(rays.o) // 2
+        if step % 8 == 0:  # an eighth of the cache
+            self.cache.refresh(self.distance, step // 8 % 8, 8)
+        jitter = torch.rand(R, cfg.samples + cfg.bg_samples, generator=gen, device=gen.device)
+        out = render_rays(self, rays, self.appearance(rays.img), jitter)
+        residual, hit = out["rgb"] - rays.rgb, out["hit"]  # (R,3), (R,)
+        error = residual.abs().mean(1)  # (R,) L1
+        mask = mask_at(self.mask.logits[pick], rays.uv) * self.mask.is_on  # (R,)
+        kept = (1 - mask) * error  # (R,) what the mask leaves of it
+        some = torch.randint(max(len(self.sfm), 1), (n,), generator=gen, device=gen.device)
+        sfm = self.sfm[some] if len(self.sfm) else self.sfm  # (n,3) or (0,3)
+        x = torch.cat([taps(out["x"], self.eps).reshape(-1, 3), random_ball(n, gen), sfm])
+        ends, off, sfm = self.distance(x).split([5 * R, n, len(sfm)])  # all points but the samples
+        lap = finite_differences(ends.reshape(R, 5), self.eps)[1]  # (R,) where rays end
+        e_curv = lap.abs() * self.eps * out["opacity"]  # (R,) flat, not transparent
+        terms = dict(rgb=kept.mean(),
+                     eik=(out["eikonal"].mean(1) * hit).sum() / hit.sum().clamp(min=1),
+                     curv=e_curv.mean(),  # [D4]
+                     lps=torch.log(self.color.bounds()).sum(),  # [D5]
+                     off=torch.exp(-50 * off.abs()).mean(),
+                     sfm=sfm.abs().sum() / n)  # [D10]
+        total = torch.stack([terms[name] for name in TERMS]) @ self.lam
+        with torch.no_grad():  # what refining and the mask will want to know
+            pixel = out["depth"] / self.scene.K[rays.img, 0]  # (R,) its size at the ray's end
+            told = torch.stack([kept, pixel], 1)  # (R,2)
+            first = step * R % len(self.hits)
+            self.hits[first:first + R] = torch.cat([out["x"], told], 1).nan_to_num(2, 2, 2)
+            bend = cfg.lam_grad * out["e_grad"] + cfg.lam_lap * e_curv  # (R,) [D3]
+            self.mask.remember(rays, residual, bend, out["opacity"])
+        if self.mask.is_on and step % MASK_EVERY == 0:
+            self.mask.calibrate(bend.detach())
+            taught, terms["gpl"] = self.mask.objective(pick)  # lam_mask L_reg + lam_GPL L_GPL
+            total = total + taught
+        return total, terms | dict(mask=mask)
+
+    def batch(self, photos: Tensor, n: int, gen: torch.Generator) -> tuple[Rays, Tensor]:
+        """n rays of one step and the photos (B,) they come from."""
+        return random_rays(self.scene, photos, n, self.cfg.photos, gen)
 
     def groups(self) -> list[dict]:
         """Optimiser groups: features fast, networks and codes slower, zeta and mask apart."""
-        cfg, grids = self.cfg, [o.features for o in self.octrees()]
-        others = [dict(params=grids, lr=cfg.lr_grid),
-                  dict(params=[self.deviation.v], lr=cfg.lr_zeta),
-                  dict(params=list(self.cgnet.parameters()), lr=8e-3)]  # learns in few steps [D14]
-        taken = {id(p) for group in others for p in group["params"]}
+        grids, mask = [o.features for o in octrees_of(self)], list(self.mask.parameters())
+        taken = {id(p) for p in [*grids, *mask, self.deviation.v]}
         nets = [p for p in self.parameters() if id(p) not in taken]
-        return [dict(params=nets, lr=cfg.lr_net), *others]
+        return [dict(params=nets, lr=self.cfg.lr_net), dict(params=grids, lr=self.cfg.lr_grid),
+                dict(params=[self.deviation.v], lr=self.cfg.lr_zeta),
+                dict(params=mask, lr=8e-3)]  # learns in few steps [D14]
 
     def start(self, gen: torch.Generator, steps: int = 200, radius: float = 0.25) -> None:
         """Warm-up: L_sphere fits the SDF to a sphere. A small one: a surface that starts inside the
         landmark grows to it, one that starts outside also has to be carved out of the sky."""
-        octree, codes = self.sdf.octree, self.codes()
-        print(f"  {octree.levels} levels, finest cell {octree.cell(octree.levels - 1):.4f}, "
-              f"{sum(map(len, octree.cells)):,} cells; exposures spread by "
-              f"{float(self.scene.raw['exposure_spread']):.3f}: appearance "
-              f"{'on' if codes.numel() else 'off'}; background "
-              f"{'on' if self.background else 'one colour'}; mask {self.cfg.mask}")
         nets = [*self.sdf.lin1.parameters(), *self.sdf.lin2.parameters()]
         grid = dict(params=[self.sdf.octree.features], lr=1e-3)
         adam = torch.optim.Adam([grid, dict(params=nets, lr=5e-3)])
         for _ in range(steps):
             x = random_ball(1024, gen)  # (P,3)
-            loss = ((self.sdf(x)[0] - (x.norm(dim=1) - radius)) ** 2).mean()
+            loss = ((self.distance(x) - (x.norm(dim=1) - radius)) ** 2).mean()
             adam.zero_grad()
             loss.backward()
             adam.step()
-        self.refresh_cache(0, 1)
-
-    def losses(self, rays: Rays, pick: Tensor, gen: torch.Generator):
-        """The objective, Eq. 5: its weighted sum, and by name the raw terms and health signals. The
-        terms that teach M come from mask_objective, every few steps [D14]."""
-        cfg, R, K, dev = self.cfg, len(rays.o), len(self.sfm), rays.o.device
-        jitter = torch.rand(R, cfg.samples + cfg.bg_samples, generator=gen, device=dev)  # (R,S+B)
-        out = in_shares(lambda *v: render_rays(self, *v), rays, self.appearance(rays.img), jitter)
-        e_grad, e_curv, hit = out["e_grad"], out["e_curv"], out["hit"]  # (R,)
-        residual = out["rgb"] - rays.rgb  # (R,3)
-        error = residual.abs().mean(1)  # (R,) L1
-        mask = mask_at(self.logits[pick], rays.uv) * self.use_mask  # (R,)
-        calibrate(cfg.lam_grad * e_grad + cfg.lam_lap * e_curv, self.calibration)
-        calibration = self.calibration if cfg.gpl == "calibrated" else None
-        edge = edge_indicator(e_grad, e_curv, cfg.lam_grad, cfg.lam_lap, calibration)  # (R,)
-        edge = out["opacity"].detach() * edge  # (R,)
-        sfm = torch.randint(max(K, 1), (R // 2 if K else 0,), generator=gen, device=dev)  # (R/2,)
-        x = torch.cat([random_ball(R // 2, gen), self.sfm[sfm]])  # (R/2 + R/2,3)
-        s = in_shares(lambda x: dict(sdf=self.sdf(x)[0]), x)["sdf"]  # (R/2 + R/2,)
-        raw = dict(rgb=((1 - mask) * error).mean(),
-                   eik=(out["eikonal"].mean(1) * hit).sum() / hit.sum().clamp(min=1),
-                   curv=e_curv.mean(),  # [D4]
-                   lps=torch.log(self.color.bounds()).sum(),  # [D5]
-                   off=torch.exp(-50 * s[:R // 2].abs()).mean(),
-                   sfm=s[R // 2:].abs().sum() / max(R // 2, 1),  # [D10]
-                   mask=mask.mean(), gpl=gpl_loss(mask, edge))
-        total = (raw["rgb"] + cfg.lam_eik * raw["eik"] + cfg.lam_curv * raw["curv"]
-                 + cfg.lam_lps * raw["lps"] + cfg.lam_off * raw["off"] + cfg.lam_sfm * raw["sfm"])
-        misfit = error.detach().nan_to_num(0, 0, 0)  # (R,) what is remembered stays finite
-        self.level.lerp_(misfit.quantile(0.25), 0.02)
-        if self.use_mask:
-            self.remember(rays, residual.detach().nan_to_num(0, 0, 0), edge.nan_to_num(0, 0, 0))
-            if self.step % cfg.mask_every == 0:
-                total = total + self.mask_objective(pick)
-        slot = (self.step * R + torch.arange(R, device=dev)) % len(self.hits)  # (R,)
-        pixel = out["depth"].detach() / self.scene.K[rays.img, 0]  # (R,) its size at the ray's end
-        told = torch.stack([(1 - mask) * misfit, pixel], 1)  # (R,2)
-        self.hits[slot] = torch.cat([out["x"], told], 1).nan_to_num(2, 2, 2)
-        health = dict(zeta=self.deviation(), opacity=out["opacity"].mean(),
-                      miss=1 - hit.float().mean(), mse=(residual ** 2).mean())
-        return total, {k: v.detach() for k, v in (raw | health).items()}
-
-    def remember(self, rays: Rays, residual: Tensor, edge: Tensor) -> None:
-        """Keeps residual (R,3) and Phi (R,) where the mask network will look for them."""
-        m = self.seen.shape[-1]
-        col, row = (rays.uv * m).long().clamp(max=m - 1).unbind(1)  # (R,)
-        self.seen[rays.img, :, row, col] = torch.cat([residual, edge[:, None]], 1)
-
-    def mask_objective(self, pick: Tensor) -> Tensor:
-        """The terms of Eq. 5 that hold M, over all pixels of photos (B,) that rays have seen. [D14]
-        Eq. 5 is linear in M: M = 1 costs a pixel its intensity and GPL and saves it its error. As a
-        sigmoid hardly moves at 0 or 1, price times M is minimised through its logistic surrogate:
-        the same sign, so the same optimum, but a slope that never vanishes. Errors are signed means
-        over 3x3 pixels, of the worst channel: what a blurred model lacks cancels, people do not.
-        Pixels that show SfM points are scene: their own error never counts for M = 1, but tells
-        what is usual. The price lies above: at first, and in fine detail, the scene is wrong."""
-        cfg, logits = self.cfg, self.cgnet(self.scene.thumbs[pick].float() / 255)  # (B,1,h,w)
-        self.logits[pick] = logits.detach()
-        residual, edge = self.seen[pick].split((3, 1), 1)  # (B,3,h,w), (B,1,h,w)
-        known = (edge >= 0).float()  # (B,1,h,w)
-        around = F.avg_pool2d(torch.cat([residual * known, known], 1), 3, 1, 1)  # (B,4,h,w)
-        mean = around[:, :3] / around[:, 3:].clamp(min=0.1)  # (B,3,h,w)
-        error = mean.abs().amax(1, keepdim=True)  # (B,1,h,w)
-        static = self.static[pick]  # (B,1,h,w)
-        usual = torch.where(static & (edge >= 0), error, math.nan).nanquantile(0.75)
-        self.usual.lerp_(torch.where(usual.isnan(), self.usual, usual), 0.1)
-        price = cfg.lam_mask + self.usual + cfg.lam_gpl * edge - error * ~static  # (B,1,h,w) [D7]
-        slope = F.softplus(torch.where(price > 0, logits, -logits))  # (B,1,h,w)
-        pull = cfg.lam_bimodal * bimodality(logits.sigmoid())
-        return (price.abs() * slope * known).mean() + pull
-
-    def mask_of(self, rays: Rays, pick: Tensor) -> Tensor:
-        """M (R,) of rays, R / B from each of photos pick (B,)."""
-        if not self.use_mask:
-            return torch.zeros_like(rays.near)
-        return mask_at(self.cgnet(self.scene.thumbs[pick].float() / 255), rays.uv)
+        self.cache.refresh(self.distance)
 
     @torch.no_grad()
-    def refresh_cache(self, part: int, parts: int) -> None:
-        """Evaluates the SDF again on every parts-th slice of the cache, from slice `part`."""
-        n = self.cache.shape[-1]
-        line = torch.linspace(-1, 1, n, device=self.cache.device)  # (n,)
-        x = torch.cartesian_prod(line[part::parts], line, line)  # (P,3)
-        size = 2 ** 18 if x.is_cuda else 2 ** 15  # launches bind a GPU, its cache a CPU
-        s = torch.cat([self.sdf(some)[0] for some in x.split(size)])  # (P,)
-        self.cache[0, 0, part::parts] = s.reshape(-1, n, n)
+    def plan(self, is_last: bool) -> dict:
+        """How to fit the model to the scene: split keys, and at last whether a mask is needed."""
+        keys, has_mask = self.sdf.octree.split_keys, self.mask.is_on
+        if self.cfg.grid == "octree":
+            zeta = float(self.deviation())
+            keys = refined_keys(self.sdf.octree, self.distance, self.hits, zeta, self.cfg.max_mb)
+        if is_last and self.cfg.mask == "auto" and has_mask:
+            share = self.mask.logits[~self.scene.is_test].sigmoid().mean().item()
+            has_mask = share > 0.01
+            print(f"  mean mask {share:.4f}: mask {'stays on' if has_mask else 'goes off'}")
+        return dict(keys=[k.cpu() for k in keys], has_mask=has_mask)
 
-    @torch.no_grad()
-    def refine(self, optimizer: torch.optim.Optimizer) -> None:
-        """Fits the octree to the scene: no fine cell far from the surface or where pictures agree.
-        Cells are newly split at the surface where that pays, coarse levels first, as far as
-        cfg.max_mb allows. A cell is merged again when nothing of it, nor within a child's side of
-        it, where corners become pinned, is nearer to the surface than HIDDEN / zeta: if |grad s| is
-        1, no pixel changes by more than 2 sigmoid(-HIDDEN) = 0.005. Adam's moments move along."""
-        octree, keys, zeta = self.sdf.octree, list(self.sdf.octree.split_keys), self.deviation()
-        hits = self.hits[self.hits[:, :3].norm(dim=1) < 1]  # (P,5) no empty slots, no missing rays
-        split_bytes = 8 * (36 + 4 * octree.features.shape[1])  # nodes, and as many corners
-        room = int(max(0, self.cfg.max_mb * 2 ** 20 - octree.bytes()) // split_bytes)
-        for level in range(min(octree.active, octree.levels - 1)):
-            s = torch.cat([self.sdf(x)[0] for x in octree.centres(level).split(CHUNK)])  # (N,)
-            reach = (math.sqrt(3) / 2 + 1) * octree.cell(level)
-            key = octree.key(octree.cells[level], level)  # (N,)
-            keys[level] = keys[level][torch.isin(keys[level], key[s.abs() < reach + HIDDEN / zeta])]
-            bound = self.cfg.split_error * self.level
-            new = worth_splitting(octree, level, hits, bound)  # (Q,)
-            new = new[torch.isin(new, key[s.abs() < reach]) & ~torch.isin(new, keys[level])][:room]
-            room -= len(new)
-            keys[level] = torch.cat([keys[level], new])
-        keys = [k.to(hits.device) for k in agreed([k.cpu() for k in keys])]
+    def follow(self, plan: dict, optimizer: torch.optim.Optimizer) -> None:
+        """Carries out a plan; Adam's moments move along with their features."""
+        octree, self.mask.is_on = self.sdf.octree, plan["has_mask"]
         old = octree.features
-        old_row = octree.build(keys)
-        moments = optimizer.state.pop(old).items()
+        old_row = octree.build([k.to(old.device) for k in plan["keys"]])
+        moments = optimizer.state.pop(old, {}).items()
         optimizer.state[octree.features] = {k: v[old_row] if v.dim() else v for k, v in moments}
         for group in optimizer.param_groups:
             group["params"] = [octree.features if p is old else p for p in group["params"]]
 
-    def maintain(self, step: int, progress: float, optimizer: torch.optim.Optimizer) -> None:
-        """Cache slices are refreshed; a few times, the model is fitted to the scene."""
-        if step % 8 == 0:
-            self.refresh_cache(step // 8 % 8, 8)
-        if self.refined == len(REFINE_AT) or progress < REFINE_AT[self.refined]:
-            return
-        if self.cfg.grid == "octree":
-            self.refine(optimizer)
-        self.refined += 1
-        if self.refined == len(REFINE_AT) and self.cfg.mask == "auto" and self.use_mask:
-            share = agreed(self.logits[~self.scene.is_test].sigmoid().mean().item())
-            self.use_mask = share > 0.01
-            print(f"  mean mask {share:.4f}: mask {'stays on' if self.use_mask else 'goes off'}")
+    def get_extra_state(self) -> bool:
+        return self.mask.is_on
 
-    @torch.no_grad()
-    def health(self) -> dict[str, Tensor]:
-        """Mean foreground opacity of rays from training photos to SfM points that they show."""
-        scene, (img, x) = self.scene, self.probes
-        if not len(img):
-            return {}
-        o = scene.c2w[img, :, 3]  # (Q,3)
-        rays = Rays(o, F.normalize(x - o, dim=1), scene.near[img], img, o[:, :2], o)
-        return dict(sfm_opacity=self.render(rays, self.appearance(img))["opacity"].mean())
+    def set_extra_state(self, state: bool) -> None:
+        self.mask.is_on = bool(state) and self.cfg.mask != "off"
+
+    def codes(self) -> Tensor:
+        """Appearance codes (I,A) of all photos."""
+        return self.appearance.weight
 
     def render(self, rays: Rays, code: Tensor) -> dict[str, Tensor]:
         """render_rays without jitter, for pictures and for fitting codes."""
@@ -1043,582 +958,270 @@ class GeoNVS(Method):
         return render_rays(self, rays, code, rays.o.new_full(shape, 0.5))
 
 
-# ---- 8 The paper's two baselines, under the same loop, protocol and meter ------------------------
-
-def positional(x: Tensor, octaves: int) -> Tensor:
-    """x (...,n) with sines and cosines of 2^k x: (...,n(1+2 octaves)) (NeRF Eq. 4, no pi)."""
-    angle = (x[..., None] * 2.0 ** torch.arange(octaves, device=x.device)).flatten(-2)
-    return torch.cat([x, angle.sin(), angle.cos()], -1)
-
-
-def mlp(*sizes: int) -> nn.Sequential:
-    """Linear layers with ReLU between them and after the last."""
-    pairs = zip(sizes, sizes[1:])
-    return nn.Sequential(*[m for a, b in pairs for m in (nn.Linear(a, b), nn.ReLU())])
-
-
-def summed(raw: dict[str, Tensor], **health: Tensor) -> tuple[Tensor, dict]:
-    """The sum of loss terms, and every figure by name."""
-    return sum(raw.values()), {k: v.detach() for k, v in (raw | health).items()}
-
-
-class RadianceField(nn.Module):
-    """NeRF's network: 8 layers with a skip to the fifth, density, then colour."""
-    def __init__(self, width: int, code_dim: int):
-        super().__init__()
-        self.first, self.second = mlp(93, *[width] * 4), mlp(93 + width, *[width] * 4)
-        self.density, self.bottleneck = nn.Linear(width, 1), nn.Linear(width, width)
-        self.color = nn.Sequential(mlp(width + 27 + code_dim, width // 2), nn.Linear(width // 2, 3))
-
-    def forward(self, x: Tensor, d: Tensor, code: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Density (R,S), colour (R,S,3), bottleneck (R,S,W) at x (R,S,3), d (R,3), code (R,A)."""
-        pe = positional(x, 15)  # (R,S,93)
-        h = self.second(torch.cat([pe, self.first(pe)], 2))  # (R,S,W)
-        neck = self.bottleneck(h)  # (R,S,W)
-        return F.softplus(self.density(h)[..., 0].float()), self.paint(neck, d, code), neck
-
-    def paint(self, neck: Tensor, d: Tensor, code: Tensor) -> Tensor:
-        """Colour (R,S,3) of samples with bottleneck (R,S,W), under an appearance code (R,A)."""
-        per_ray = torch.cat([positional(d, 4), code], 1)[:, None].expand(-1, neck.shape[1], -1)
-        return torch.sigmoid(self.color(torch.cat([neck, per_ray], 2)).float())
-
-
-class NeRFW(Method):
-    """NeRF-W (Martin-Brualla et al. 2021): appearance codes, transient head with uncertainty. From
-    the paper: two networks, 48 + 16 code dims, losses, lambda_u = 0.01. From its PyTorch version:
-    width 256, 64 + 64 samples, beta_min 0.03, Adam 5e-4, 1024 rays, SfM near and far."""
-
-    code_dim, use_mask, adam = 48, True, dict(betas=(0.9, 0.999), eps=1e-8)
-
-    def __init__(self, cfg: Config, scene: Scene):
-        super().__init__()
-        self.cfg, self.scene = cfg, scene
-        self.coarse, self.fine = (RadianceField(cfg.hidden, self.code_dim) for _ in range(2))
-        points = scene.points[::20] if len(scene.points) else scene.c2w.new_zeros(1, 3)
-        reach = (points - scene.c2w[:, None, :, 3]).norm(dim=2)  # (I,K/20)
-        self.register_buffer("far", reach.quantile(0.999, dim=1), persistent=False)  # (I,)
-        self.make_heads(len(scene.wh))
-        self.to(scene.c2w.device)
-
-    def make_heads(self, photos: int) -> None:
-        half = self.cfg.hidden // 2
-        self.appearance = nn.Embedding(photos, self.code_dim)
-        self.transient = nn.Embedding(photos, 16)
-        self.head, self.head_out = mlp(self.cfg.hidden + 16, *[half] * 4), nn.Linear(half, 5)
-
-    def groups(self) -> list[dict]:
-        return [dict(params=list(self.parameters()), lr=self.cfg.lr_net)]
-
-    def render(self, rays: Rays, code: Tensor, jitter: Tensor | None = None,
-               transient: Tensor | None = None) -> dict[str, Tensor]:
-        """Coarse and fine pass. transient: (R,16) codes of the transient head, or None."""
-        n, R, dev = self.cfg.samples, len(rays.o), code.device
-        u = torch.full((R, 2 * n), 0.5, device=dev) if jitter is None else jitter
-        u = (torch.arange(n, device=dev).repeat(2) + u) / n  # (R,2n) stratified twice
-        edges = torch.linspace(0, 1, n + 1, device=dev)
-        edges = rays.near[:, None] + (self.far[rays.img] - rays.near)[:, None] * edges  # (R,n+1)
-        t = inverse_cdf(edges, torch.ones_like(edges[:, 1:]), u[:, :n])  # (R,n)
-        out = self.pass_through(self.coarse, rays, t, code, None)
-        more = inverse_cdf(edges, out["w"].detach() + 1e-3, u[:, n:])  # (R,n)
-        t = torch.cat([t, more], 1).sort(1)[0]  # (R,2n)
-        return self.pass_through(self.fine, rays, t, code, transient) | dict(coarse=out["rgb"])
-
-    def pass_through(self, field: RadianceField, rays: Rays, t: Tensor, code: Tensor,
-                     transient: Tensor | None) -> dict[str, Tensor]:
-        """Densities to a picture: C = sum T (alpha_s c_s + alpha_t c_t) (NeRF-W Eq. 5)."""
-        sigma, rgb, neck = field(rays.at(t), rays.d, code)  # (R,S), (R,S,3), (R,S,W)
-        dt = F.pad(torch.diff(t), (0, 1), value=100.0)  # (R,S), last opaque
-        alpha = 1 - torch.exp(-sigma * dt)  # (R,S)
-        if transient is None:
-            w, _ = composite(alpha)  # (R,S)
-            return dict(rgb=(w[..., None] * rgb).sum(1), depth=(w * t).sum(1), w=w, neck=neck)
-        code_t = transient[:, None].expand(-1, t.shape[1], -1)  # (R,S,16)
-        h = self.head_out(self.head(torch.cat([neck, code_t], 2)))  # (R,S,5)
-        sigma_t, beta = F.softplus(h[..., 0]), F.softplus(h[..., 4])  # (R,S)
-        alpha_t = 1 - torch.exp(-sigma_t * dt)  # (R,S)
-        w, _ = composite(1 - torch.exp(-(sigma + sigma_t) * dt))  # (R,S)
-        before = w / (1 - torch.exp(-(sigma + sigma_t) * dt)).clamp(min=1e-10)  # (R,S) T
-        mixed = alpha[..., None] * rgb + alpha_t[..., None] * torch.sigmoid(h[..., 1:4])  # (R,S,3)
-        return dict(rgb=(before[..., None] * mixed).sum(1), depth=(w * t).sum(1), w=w,
-                    beta=(before * alpha_t * beta).sum(1) + 0.03, sigma_t=sigma_t.mean(1),
-                    transient=(before * alpha_t).sum(1))
-
-    def losses(self, rays: Rays, pick: Tensor, gen: torch.Generator):
-        """NeRF-W Eq. 13: squared error over learned variance, its log, a price on transients."""
-        jitter = torch.rand(len(rays.o), 2 * self.cfg.samples, generator=gen, device=rays.o.device)
-        out = in_shares(self.render, rays, self.codes()[rays.img], jitter, self.transient(rays.img))
-        error = ((out["rgb"] - rays.rgb) ** 2).sum(1)  # (R,)
-        raw = dict(coarse=((out["coarse"] - rays.rgb) ** 2).sum(1).mean() / 2,
-                   rgb=(error / (2 * out["beta"] ** 2)).mean(),
-                   beta=3 + torch.log(out["beta"]).mean(), sigma=0.01 * out["sigma_t"].mean())
-        return summed(raw, mask=out["transient"].mean(), mse=error.mean() / 3)
-
-    def mask_of(self, rays: Rays, pick: Tensor) -> Tensor:
-        """Opacity (R,) of the transient part."""
-        codes = self.codes()[rays.img], None, self.transient(rays.img)
-        return self.render(rays, *codes)["transient"]
-
-
-class HaNeRF(NeRFW):
-    """Ha-NeRF (Chen et al. 2022): appearance from a CNN over the photo, mask by an MLP of pixels.
-    From the authors' code: network sizes, 64 + 64 samples, one 32x32 grid of rays per step, loss
-    weights, Adam 5e-4. Left out: the mode-seeking term (weight 1e-6), noise on densities."""
-    def make_heads(self, photos: int) -> None:
-        sizes = [(3, 64, 7, 1), (64, 128, 4, 2), *[(a, 256, 4, 2) for a in (128, 256, 256)]]
-        convs = [m for a, b, k, s in sizes for m in (
-            nn.Conv2d(a, b, k, s, (k - 1) // 2, padding_mode="reflect"), nn.ReLU())]
-        self.encoder = nn.Sequential(*convs, nn.AdaptiveAvgPool2d(1),
-                                     nn.Conv2d(256, self.code_dim, 1), nn.Flatten())
-        self.register_buffer("bank", torch.zeros(photos, self.code_dim))  # last code of each photo
-        self.mask_code = nn.Embedding(photos, 128)
-        self.mask_mlp = nn.Sequential(mlp(128 + 42, *[256] * 4), nn.Linear(256, 1), nn.Sigmoid())
-
-    def encode(self, pick: Tensor) -> Tensor:
-        """Codes (B,A) of photos (B,)."""
-        return self.encoder(self.scene.thumbs[pick].float() / 127.5 - 1)
-
-    @torch.no_grad()
-    def codes(self) -> Tensor:
-        photos = torch.arange(len(self.scene.wh), device=self.scene.wh.device)
-        return torch.cat([self.encode(pick) for pick in photos.split(8)])
-
-    def batch(self, photos: Tensor, gen: torch.Generator) -> tuple[Rays, Tensor]:
-        """A square grid of rays over a random window of one photo."""
-        pick = photos[torch.randint(len(photos), (1,), generator=gen, device=photos.device)]
-        size = 0.5 + 0.5 * torch.rand(1, generator=gen, device=photos.device)
-        corner = torch.rand(2, generator=gen, device=photos.device) * (1 - size)
-        grid = torch.linspace(0, 1, math.isqrt(self.cfg.rays), device=photos.device)
-        uv = torch.cartesian_prod(grid, grid).flip(1) * size + corner  # (R,2)
-        w, h = self.scene.wh[pick].T  # (1,), (1,)
-        pixel = (uv[:, 1] * (h - 1)).round().long() * w + (uv[:, 0] * (w - 1)).round().long()
-        return make_rays(self.scene, pick.expand(len(pixel)), pixel), pick
-
-    def losses(self, rays: Rays, pick: Tensor, gen: torch.Generator):
-        """Ha-NeRF Eq. 9: masked colour, a falling price on masks, codes that survive a render: of
-        the same rays in another photo's light."""
-        R, side = len(rays.o), math.isqrt(self.cfg.rays)
-        jitter = torch.rand(R, 2 * self.cfg.samples, generator=gen, device=rays.o.device)
-        code = self.encode(pick)  # (1,A)
-        other = self.bank[torch.randint(len(self.bank), (1,), generator=gen, device=pick.device)]
-        other = torch.where(other.any(), other, code.detach())  # (1,A) of another photo, once known
-        self.bank[pick] = code.detach().float()
-        out = in_shares(self.render, rays, code.expand(R, -1), jitter, other.expand(R, -1))
-        mask = self.mask_of(rays, pick)  # (R,)
-        error, coarse = (((out[k] - rays.rgb) ** 2).mean(1) for k in ("rgb", "coarse"))  # (R,)
-        window = out["other"].reshape(1, side, side, 3).permute(0, 3, 1, 2)
-        again = self.encoder(window * 2 - 1)  # (1,A)
-        price = max(6e-3, 5e-2 * math.exp(-1e-3 * self.step))
-        raw = dict(rgb=((1 - mask) * error).mean() / 2,
-                   coarse=((1 - mask.detach()) * coarse).mean() / 2,
-                   size=price * (mask ** 2).mean(), code=1e-5 * (code ** 2).mean(),
-                   again=1e-3 * (again - other).abs().mean())
-        return summed(raw, mask=mask.mean(), mse=error.mean())
-
-    def pass_through(self, field: RadianceField, rays: Rays, t: Tensor, code: Tensor,
-                     other: Tensor | None) -> dict[str, Tensor]:
-        """The static picture; with the codes (R,A) of another photo also its colours there."""
-        out = super().pass_through(field, rays, t, code, None)
-        neck, w = out.pop("neck").detach(), out["w"].detach()[..., None]  # only colours learn
-        return out if other is None else out | dict(
-            other=(w * field.paint(neck, rays.d, other)).sum(1))
-
-    def mask_of(self, rays: Rays, pick: Tensor) -> Tensor:
-        per_ray = torch.cat([self.mask_code(rays.img), positional(rays.uv, 10)], 1)
-        return self.mask_mlp(per_ray)[:, 0]
-
-
-# ---- 9 Energy meter ------------------------------------------------------------------------------
+# ---- 8 Energy ------------------------------------------------------------------------------------
 
 class EnergyMeter:
-    """Joules between start() and stop(), by an energy counter and by integrated power samples.
-    counter() returns joules; power() watts, integrated by the trapezoid rule every `period`
-    seconds. Without either the energy is None, never 0. Windows add up: evaluation can be left out,
-    and a resumed run goes on counting."""
-    def __init__(self, source=None, counter=None, power=None, period=0.5, clock=time.monotonic):
-        self.source, self.counter, self.power = source, counter, power
-        self.period, self.clock = period, clock
-        self.joules, self.sampled_joules = 0.0 if counter else None, 0.0 if power else None
-        self.idle_w = power() if power else None  # read before any work
-        self.last = None  # clock, counter and power at the last tick
+    """Joules from tick to tick: counter() returns joules so far, or power() watts, which are
+    integrated by the trapezoid rule. With neither, joules is None, never 0."""
+    def __init__(self, source=None, counter=None, power=None, clock=time.monotonic):
+        self.source, self.counter, self.power, self.clock = source, counter, power, clock
+        self.joules, self.last = 0.0 if counter or power else None, None
 
-    def tick(self) -> None:
-        """Adds what was spent since the last tick. A failed reading ends metering, not the run."""
+    def tick(self, period: float = 0.0) -> None:
+        """Adds what was spent since the last reading, if that is `period` seconds ago. A reading
+        that fails ends metering, not the run."""
+        now = self.clock()
+        if self.joules is None or self.last and now < self.last[0] + period:
+            return
         try:
-            now = self.clock(), self.counter and self.counter(), self.power and self.power()
+            value = (self.counter or self.power)()
         except Exception as error:  # drivers raise what they like
             print(f"  energy is null, as it could not be read any more ({error})")
-            self.counter = self.power = self.joules = self.sampled_joules = self.source = None
+            self.source = self.joules = None
             return
-        if self.last and self.joules is not None:
-            self.joules += now[1] - self.last[1]
-        if self.last and self.sampled_joules is not None:
-            self.sampled_joules += (now[2] + self.last[2]) / 2 * (now[0] - self.last[0])
-        self.last = now
-
-    def start(self) -> None:
-        self.last, self.stopped = None, threading.Event()
-        self.tick()
-        self.thread = threading.Thread(target=self.run, daemon=True)
-        self.thread.start()
-
-    def run(self) -> None:
-        while not self.stopped.wait(self.period):
-            self.tick()
-
-    def stop(self) -> None:
-        self.stopped.set()
-        self.thread.join()
-        self.tick()
-
-    def totals(self) -> list[float | None]:
-        """Joules by counter and by samples, over all processes; None if one cannot tell."""
-        each = [(agreed(self.joules, i), agreed(self.sampled_joules, i)) for i in range(RANKS)]
-        return [None if None in joules else sum(joules) for joules in zip(*each)]
-
-    def report(self) -> dict:
-        """Watt-hours by counter, else by samples; None where there is neither."""
-        counter, sampled = (None if j is None else j / 3600 for j in self.totals())
-        off = abs(counter / sampled - 1) > 0.05 if counter and sampled else None
-        return dict(energy_wh=sampled if counter is None else counter, energy_wh_sampled=sampled,
-                    energy_source=self.source, energy_disagrees=off, idle_w=self.idle_w)
+        if self.last:
+            then, before = self.last
+            self.joules += value - before if self.counter else (value + before) / 2 * (now - then)
+        self.last = now, value
 
 
 def rapl_meter(root: str = "/sys/class/powercap") -> EnergyMeter:
-    """Processor packages through RAPL where readable (often by root only), or None."""
+    """Processor packages through RAPL where readable (often by root only), or no source."""
     packages = [p for p in sorted(Path(root).glob("intel-rapl:*"))
                 if p.name.count(":") == 1 and os.access(p / "energy_uj", os.R_OK)]
 
     def read(name):
-        return [int((p / name).read_text()) for p in packages]
+        return np.array([int((p / name).read_text()) for p in packages])
     wraps, last, total = read("max_energy_range_uj"), read("energy_uj"), 0
 
     def counter():  # each package wraps on its own
         nonlocal last, total
         now = read("energy_uj")
-        total, last = total + sum((b - a) % w for a, b, w in zip(last, now, wraps)), now
+        total, last = total + int(((now - last) % wraps).sum()), now
         return total / 1e6
-    return EnergyMeter("rapl", counter) if packages else EnergyMeter()
+    return EnergyMeter("rapl counter, read every 0.5 s", counter) if packages else EnergyMeter()
 
 
 def make_meter(device: torch.device) -> EnergyMeter:
     """NVML for a GPU, found by UUID whatever CUDA_VISIBLE_DEVICES says; RAPL for a CPU; or none."""
-    if device.type != "cuda":  # one process reads for its whole machine; side by side none can tell
-        return EnergyMeter("rapl", float) if LOCAL_RANK else (
-            EnergyMeter() if parent_process() else rapl_meter())
+    if device.type != "cuda":
+        return EnergyMeter("rapl", float) if LOCAL_RANK else rapl_meter()  # one reads for a machine
     try:
         import pynvml
         pynvml.nvmlInit()
         uuid = torch.cuda.get_device_properties(device).uuid
         gpu = pynvml.nvmlDeviceGetHandleByUUID(f"GPU-{uuid}")
-        power = lambda: pynvml.nvmlDeviceGetPowerUsage(gpu) / 1e3
-        counter = lambda: pynvml.nvmlDeviceGetTotalEnergyConsumption(gpu) / 1e3
-        try:
-            counter()
-        except pynvml.NVMLError:  # vGPUs and GPUs before Volta have none
-            counter = None
-        return EnergyMeter("nvml", counter, power)
-    except ImportError:
-        print("  no GPU energy: pip install nvidia-ml-py")
-    except pynvml.NVMLError as error:
-        print(f"  no GPU energy: {error}")
+        for name, read in (("counter", pynvml.nvmlDeviceGetTotalEnergyConsumption),
+                           ("power", pynvml.nvmlDeviceGetPowerUsage)):  # both in thousandths
+            with contextlib.suppress(pynvml.NVMLError):  # GPUs before Volta have no counter
+                read(gpu)
+                how = {name: lambda: read(gpu) / 1e3}
+                return EnergyMeter(f"nvml {name}, read every 0.5 s", **how)
+    except Exception as error:  # not installed, or the driver does not tell
+        print(f"  no GPU energy ({error}): pip install nvidia-ml-py")
     return EnergyMeter()
 
 
-# ---- 10 Training ---------------------------------------------------------------------------------
+# ---- 9 Training ----------------------------------------------------------------------------------
 
-METHODS = {  # class, settings (the baselines': published), those that serve the toy best
-    "geonvsw": (GeoNVS, {}, dict(rays=256)),
-    "nerfw": (NeRFW, dict(rays=1024, photos=1024, samples=64, hidden=256, lr_net=5e-4),
-              dict(rays=256, photos=256, samples=24, hidden=64, lr_net=5e-3)),
-    "hanerf": (HaNeRF, dict(rays=1024, photos=1, samples=64, hidden=256, lr_net=5e-4),
-               dict(rays=256, samples=16, hidden=64, lr_net=4e-3)),
-}
-CHECKPOINT_S = 60.0  # seconds of training between checkpoints
+REFINE_AT = (0.1, 0.2, 0.3, 0.45, 0.6)  # shares of training at which the octree is refined
 PATIENCE = 20  # steps in a row without a finite loss and gradient that stop a run
-HEALTH = {  # lowest and highest healthy value after a third of training, and what it can mean
-    "zeta": (30, math.inf, "the surface stays blurred: wrong poses or scale, or too few steps"),
-    "sfm_opacity": (0.7, math.inf, "rays to SfM points pass through: the background paints the "
-                    "landmark; raise --lam_sfm or train longer"),
-    "mask": (0, 0.5, "the mask covers half of the picture: raise --lam_mask"),
-    "eik": (0, 0.5, "the SDF is no distance: raise --lam_eik or lower --lr_grid"),
-    "miss": (0, 0.6, "most rays miss the unit sphere: is it the right landmark that it surrounds?"),
-}
+# torchrun starts RANKS processes. Each draws its own rays, the gradients are averaged, the first
+# process decides, speaks and writes; so all hold the same weights.
+RANK, LOCAL_RANK, RANKS = (int(os.environ.get(name, default)) for name, default in (
+    ("RANK", 0), ("LOCAL_RANK", 0), ("WORLD_SIZE", 1)))
+atomic_write = (lambda path, write: None) if RANK else atomic_write
+
+
+def agreed(value, source: int = 0):
+    """The value that one process has, for all of them."""
+    box = [value]
+    if RANKS > 1:
+        dist.broadcast_object_list(box, source)
+    return box[0]
 
 
 class Diverged(UserError):
     """Training was stopped, as its losses or gradients were not finite."""
 
 
-def make_optimizer(model: Method) -> torch.optim.Adam:
-    groups = [group | dict(base_lr=group["lr"]) for group in model.groups()]
-    return torch.optim.Adam(groups, **model.adam, fused=True)
+def training_step(model, optimizer, photos: Tensor, state: dict, progress: float, gen):
+    """One update; the learning rate rises for 20 steps, then follows a cosine down to 5 %. Returns
+    the raw terms of the loss, and 1 if a loss or gradient that is not finite made the step void.
+    Nothing in it asks the device for a value."""
+    rays, pick = model.batch(photos, model.cfg.rays // RANKS, gen)
+    loss, terms = model.losses(rays, pick, state["step"], gen)
+    optimizer.zero_grad()
+    loss.backward()
+    grads = [p.grad for p in model.parameters() if p.grad is not None]
+    if RANKS > 1:  # their mean over the processes
+        flat = nn.utils.parameters_to_vector(grads)
+        dist.all_reduce(flat)
+        nn.utils.vector_to_parameters(flat / RANKS, grads)
+    is_void = ~torch.isfinite(nn.utils.get_total_norm(grads) + loss.detach())
+    optimizer.found_inf = is_void.float()  # fused Adam leaves such a step out
+    factor = min(1, (state["step"] + 1) / 20) * (0.525 + 0.475 * math.cos(math.pi * progress))
+    for group, now in zip(optimizer.param_groups, model.groups()):
+        group["lr"] = factor * now["lr"]
+    optimizer.step()
+    state["step"] += 1
+    return terms, is_void.long()
 
 
-def set_learning_rate(optimizer, step: int, progress: float) -> None:
-    """Linear warm-up over 20 steps, then a cosine down to 5 %."""
-    factor = min(1, (step + 1) / 20) * (0.05 + 0.95 * (1 + math.cos(math.pi * progress)) / 2)
-    for group in optimizer.param_groups:
-        group["lr"] = group["base_lr"] * factor
+def save_checkpoint(path: Path, model, optimizer, gen, state: dict) -> None:
+    buffer = io.BytesIO()
+    torch.save(dict(config=asdict(model.cfg), model=model.state_dict(), rng=gen.get_state(),
+                    optimizer=optimizer.state_dict(), state=state,
+                    octrees=[o.split_keys for o in octrees_of(model)]), buffer)
+    atomic_write(path, lambda tmp: Path(tmp).write_bytes(buffer.getbuffer()))
 
 
-def write_text(path: Path, text: str) -> None:
-    atomic_write(path, lambda tmp: Path(tmp).write_text(text))
-
-
-def save_checkpoint(path: Path, cfg: Config, model, optimizer, gen, state: dict) -> None:
-    whole = dict(
-        geonvs=1, config=asdict(cfg), model=model.state_dict(), optimizer=optimizer.state_dict(),
-        octrees=[o.split_keys for o in model.octrees()], rng=gen.get_state(), state=state)
-
-    def write(tmp):
-        try:
-            torch.save(whole, tmp)
-        except RuntimeError as error:  # so torch reports a full disk
-            raise OSError(str(error)) from error
-    atomic_write(path, write)
-
-
-def read_checkpoint(path: Path) -> dict:
-    """A checkpoint's dictionary: tensors and plain values, never code. Raises UserError."""
+def read_checkpoint(path: Path, given: dict) -> tuple[dict, Config]:
+    """A checkpoint's dictionary, tensors and plain values, never code; and its settings, replaced
+    by those given. Raises UserError."""
     need(path.exists(), f"{path} does not exist: train first, without --resume or --render, or "
          "name the run by the --data, --seed and --name that it was made with")
     try:
         data_prep.refuse_bomb(path)
         saved = dict(torch.load(path, map_location="cpu", weights_only=True))
-        config, step = saved["config"], saved["state"]["step"]
-        kinds = {f.name: (float, int) if f.type == "float" else type(f.default)
-                 for f in fields(Config)}
-        need(saved["geonvs"] == 1 and config.keys() == kinds.keys()
-             and all(isinstance(config[name], kind) for name, kind in kinds.items())
-             and isinstance(step, int) and step >= 0, "")
-        return saved
+        cfg = Config(**saved["config"])
+        check(cfg)
+        need(saved["state"]["step"] >= 0, "")
     except Exception as error:  # a damaged file can fail in any layer: zip, pickle, tensor storage
         raise UserError(f"{path} is damaged or not a checkpoint of this program "
                         f"({type(error).__name__}): delete it and train again") from None
+    return saved, replace(cfg, **given)
 
 
-def restore(saved: dict, path: Path, model, optimizer, gen: torch.Generator) -> dict:
-    """Puts a checkpoint back into model, optimiser and generator; returns its state."""
+def restore(saved: dict, path: Path, model, gen=None) -> torch.optim.Adam:
+    """Puts a checkpoint's weights into a model, its state into gen; returns its optimiser."""
     try:
-        for octree, keys in zip(model.octrees(), saved["octrees"], strict=True):
+        for octree, keys in zip(octrees_of(model), saved["octrees"], strict=True):
             octree.build([k.to(octree.features.device) for k in keys])
         model.load_state_dict(saved["model"])
-        if optimizer is not None:
-            for group, new in zip(optimizer.param_groups, model.groups(), strict=True):
-                group["params"] = new["params"]
-            optimizer.load_state_dict(saved["optimizer"])
-            for group, new in zip(optimizer.param_groups, model.groups()):
-                group["base_lr"] = new["lr"]  # flags may have changed it
-            for p, moments in optimizer.state.items():
-                shapes = dict(step=torch.Size(), exp_avg=p.shape, exp_avg_sq=p.shape)
-                if {k: v.shape for k, v in moments.items()} != shapes:
-                    raise ValueError("Adam's moments have other shapes")
+        optimizer = torch.optim.Adam(model.groups(), **model.adam, fused=True)
+        optimizer.load_state_dict(saved["optimizer"])
+        need(all(m[k].shape == p.shape for p, m in optimizer.state.items()
+                 for k in ("exp_avg", "exp_avg_sq")), "Adam's moments have other shapes")
+        if gen is not None:
             gen.set_state(saved["rng"])
-        return saved["state"]
-    except (KeyError, IndexError, ValueError, RuntimeError, TypeError, AttributeError) as error:
+        return optimizer
+    except (LookupError, ValueError, RuntimeError, TypeError, AttributeError, UserError) as error:
         raise UserError(f"{path} does not fit this scene and these settings "
                         f"({str(error).splitlines()[0][:90]}): delete it or use the flags and "
                         "the kind of device it was made with") from None
 
 
-LOSS_SCALE = 2.0 ** 10  # lifts small gradients above what float16 can hold
-
-
-def half_dtype(device: torch.device) -> torch.dtype:
-    """What mixed precision computes in: bfloat16, or float16 on GPUs that have no other."""
-    lacks = device.type == "cuda" and torch.cuda.get_device_capability(device) < (8, 0)
-    return torch.float16 if lacks else torch.bfloat16
-
-
-def training_step(model: Method, optimizer, photos: Tensor, state: dict, progress: float,
-                  gen: torch.Generator) -> tuple[dict, Tensor]:
-    """One update. Returns the logs, and 1 if a loss or gradient that is not finite made it void."""
-    cfg, device, model.step = model.cfg, photos.device, state["step"]
-    rays, pick = model.batch(photos, gen)
-    is_half = cfg.amp == "on" or cfg.amp == "auto" and device.type == "cuda"
-    half = half_dtype(device)
-    with torch.autocast(device.type, half, enabled=is_half):
-        loss, logs = model.losses(rays, pick, gen)
-    scale = LOSS_SCALE if is_half and half == torch.float16 else 1.0
-    optimizer.zero_grad()
-    (scale * loss).backward()
-    set_learning_rate(optimizer, state["step"], progress)
-    grads = [p.grad for p in model.parameters() if p.grad is not None]
-    if RANKS > 1:  # their mean over the processes
-        flat = nn.utils.parameters_to_vector(grads)
-        dist.all_reduce(flat)
-        nn.utils.vector_to_parameters(flat.div_(RANKS), grads)
-    optimizer.grad_scale = None if scale == 1 else torch.full((), scale, device=device)
-    optimizer.found_inf = (~torch.isfinite(nn.utils.get_total_norm(grads) + loss.detach())).float()
-    optimizer.step()
-    model.maintain(state["step"], progress, optimizer)
-    state["step"] += 1
-    return logs, optimizer.found_inf.long()
-
-
-def prepare(cfg: Config, scene: Scene, run: Path, saved: dict | None):
-    """What training begins with, new or from a checkpoint: model, optimiser, meter, generator and
-    state. The run's folder keeps nothing of a former run, of the log what the checkpoint knows."""
-    device = scene.c2w.device
+def train(cfg: Config, scene: Scene, run: Path, saved: dict | None = None, kind=GeoNVS):
+    """Trains until cfg.steps or cfg.minutes; writes log.jsonl and checkpoint.pt below run. saved: a
+    checkpoint to go on from; kind: class of the model. Returns model and state (step, refined,
+    seconds, joules, dropped, source)."""
+    begin, checkpoint = time.perf_counter(), run / "checkpoint.pt"
     torch.set_flush_denormal(True)  # vanishing weights would otherwise slow a CPU down
     torch.manual_seed(cfg.seed)
-    gen = torch.Generator(device).manual_seed(cfg.seed)
-    model = METHODS[cfg.method][0](cfg, scene)
-    optimizer, meter = make_optimizer(model), make_meter(device)
-    state = dict(step=0, seconds=0.0, dropped=0, curve=[], codes=None)
-    if device.type == "cuda":
-        torch.cuda.reset_peak_memory_stats(device)
-    if saved is not None:
-        state |= restore(saved, run / "checkpoint.pt", model, optimizer, gen)
-        state |= dict(joules=0.0, sampled_joules=0.0) if RANK else {}  # what all spent counts once
-        meter.joules = state["joules"] if meter.counter else None  # all of it was measured, or None
-        meter.sampled_joules = state["sampled_joules"] if meter.power else None
-    elif not RANK:  # nothing of a former run may be taken for this one's
-        for name in ("checkpoint.pt", "metrics.json", "panel.png", "mesh.ply"):
+    gen = torch.Generator(scene.c2w.device).manual_seed(cfg.seed)
+    model, meter, terms = kind(cfg, scene), make_meter(scene.c2w.device), {}
+    state = dict(step=0, refined=0, seconds=0.0, dropped=0, joules=0.0)
+    meter.tick()
+    if saved is None:  # nothing of a former run may be taken for this one's
+        for name in ("checkpoint.pt", "log.jsonl", "metrics.json", "panel.png", "mesh.ply",
+                     "film.mp4"):
             (run / name).unlink(missing_ok=True)
-    log = run / "log.jsonl"
-    lines = log.read_text().splitlines(True) if saved and log.exists() else []
-    write_text(log, "".join(k for k in lines if k.endswith("\n")
-                            and json.loads(k)["step"] <= state["step"]))
-    return model, optimizer, meter, gen, state
-
-
-def train(cfg: Config, scene: Scene, run: Path, saved: dict | None = None):
-    """Trains until cfg.steps or cfg.minutes; writes log.jsonl and checkpoint.pt below run. saved: a
-    checkpoint to go on from. Returns model, state (step, seconds, joules, curve), meter. Evaluation
-    moments are outside the timed and metered window."""
-    model, optimizer, meter, gen, state = prepare(cfg, scene, run, saved)
-    device, checkpoint, log_path = scene.c2w.device, run / "checkpoint.pt", run / "log.jsonl"
-    photos, held_out = scene.photos(False), scene.photos(True)  # (B,)
-    dropped = torch.tensor(state["dropped"], device=device)
-    streak, warned = torch.zeros_like(dropped), set()  # void steps in a row; warnings given
-    last_line = since = time.perf_counter()
-    last_save = state["seconds"]
-    meter.start()
-    if saved is None:
         model.start(gen)
-    for value in model.state_dict().values():
-        if RANKS > 1 and torch.is_tensor(value):  # GPUs do not repeat their sums to the last bit
+        optimizer = torch.optim.Adam(model.groups(), **model.adam, fused=True)
+    else:
+        optimizer, state = restore(saved, checkpoint, model, gen), state | saved["state"]
+    for value in model.state_dict().values() if RANKS > 1 else ():
+        if torch.is_tensor(value):
             dist.broadcast(value, 0)
-
-    def clock():  # training seconds so far
-        return state["seconds"] + time.perf_counter() - since
-
-    def save():
-        state.update(zip(("joules", "sampled_joules"), meter.totals()), dropped=int(dropped))
-        save_checkpoint(checkpoint, cfg, model, optimizer, gen, state | dict(seconds=clock()))
-    stop = threading.Event()  # Ctrl-C lets a step end, so that what is saved is whole
-    handler = signal.signal(signal.SIGINT, lambda *_: stop.set())
-    try:
-        while True:
-            seconds, is_stopped = agreed((clock(), stop.is_set()))
-            share = seconds / (60 * cfg.minutes) if cfg.minutes else state["step"] / cfg.steps
-            progress = min(share, 1.0)
-            if progress == 1 or is_stopped:
-                break
-            logs, is_dropped = training_step(model, optimizer, photos, state, progress, gen)
-            dropped += is_dropped
-            streak = (streak + 1) * is_dropped
-            if state["step"] % PATIENCE == 0 and int(streak) >= PATIENCE:
-                break
-            if cfg.curve and len(held_out) and seconds > 4 * 1.6 ** len(state["curve"]):
-                int(dropped)  # waits for a GPU: what it has queued is training
-                state["seconds"] = clock()
-                meter.stop()  # looking costs neither time nor energy
-                state["codes"], value = (None, 0) if RANK else validate(
-                    model, scene, held_out, state["codes"])
-                state["curve"].append(dict(step=state["step"], seconds=state["seconds"], psnr=value,
-                                           wh=meter.report()["energy_wh"]))
-                meter.start()
-                since = time.perf_counter()
-            if RANK == 0 and (time.perf_counter() > last_line + 5 or state["step"] == cfg.steps):
-                last_line = time.perf_counter()
-                logs = model.health() | logs
-                report(cfg, log_path, state["step"], clock(), progress, logs, int(dropped), warned)
-            if seconds - last_save > CHECKPOINT_S:
-                save()
-                last_save = seconds
-    finally:
-        signal.signal(signal.SIGINT, handler)
-        if device.type == "cuda":
-            torch.cuda.synchronize()
-        meter.stop()
-        spent = clock()
-    save()
-    if int(streak) >= PATIENCE:
-        raise Diverged(f"the last {int(streak)} steps had no finite loss or gradient; {checkpoint} "
-                       "holds the last good weights. Likely causes: learning rates too high (try a "
-                       "third of --lr_grid and --lr_net), half precision (--amp off), broken poses")
+    if RANK:
+        gen.manual_seed(cfg.seed + RANK + RANKS * state["step"])  # own rays for each process
+    photos, begin, spent = scene.photos(False), begin - state["seconds"], state["joules"]
+    next_line, next_save = state["seconds"] + 5, state["seconds"] + 60
+    dropped = torch.tensor(state["dropped"], device=photos.device)
+    streak, stop = torch.zeros_like(dropped), threading.Event()  # void steps in a row
+    handler = signal.signal(signal.SIGINT, lambda *_: stop.set())  # Ctrl-C lets a step end
+    while True:
+        seconds, is_stopped = agreed((time.perf_counter() - begin, stop.is_set()))
+        progress = seconds / (60 * cfg.minutes) if cfg.minutes else state["step"] / cfg.steps
+        has_diverged = state["step"] % PATIENCE == 0 and int(streak) >= PATIENCE
+        is_over = progress >= 1 or is_stopped or has_diverged
+        meter.tick(0 if is_over else 0.5)
+        if is_over or seconds > next_line:
+            joules = [spent, *(agreed(meter.joules, i) for i in range(RANKS))]
+            state |= dict(dropped=int(dropped), source=meter.source,  # waits for a GPU's queue
+                          joules=None if None in joules else sum(joules))
+            state["seconds"] = agreed(time.perf_counter() - begin)
+            report(model, run / "log.jsonl", progress, state, terms)
+            next_line = seconds + 5
+        if is_over or seconds > next_save:
+            save_checkpoint(checkpoint, model, optimizer, gen, state)
+            took = time.perf_counter() - begin - state["seconds"]
+            next_save = seconds + max(60, 50 * took)  # a large one less often: 2 % of the time
+        if is_over:
+            break
+        terms, is_void = training_step(model, optimizer, photos, state, progress, gen)
+        dropped, streak = dropped + is_void, (streak + 1) * is_void
+        if state["refined"] < len(REFINE_AT) and progress >= REFINE_AT[state["refined"]]:
+            state["refined"] += 1
+            model.follow(agreed(model.plan(state["refined"] == len(REFINE_AT))), optimizer)
+    signal.signal(signal.SIGINT, handler)
     need(not is_stopped, f"stopped at step {state['step']}; add --resume to go on")
-    state["seconds"] = spent
-    return model, state, meter
+    if has_diverged:
+        raise Diverged(f"the last {int(streak)} steps had no finite loss or gradient; likely: "
+                       "learning rates too high (try a third of --lr_grid and --lr_net) or broken "
+                       f"poses; {checkpoint} holds the last good weights")
+    return model, state
 
 
-def report(cfg, log_path, step, seconds, progress, logs, dropped, warned: set) -> None:
-    """A line on the terminal and one in log.jsonl; a warning, once, where a figure is unhealthy."""
-    values = {k: float(v) for k, v in logs.items()}
-    values["psnr"] = -10 * math.log10(max(values.pop("mse"), 1e-10))
-    rate, left = step * cfg.rays / seconds, seconds / max(progress, 1e-3) * (1 - progress)
-    print(f"  step {step:6d}  psnr {values['psnr']:5.2f}  zeta {values.get('zeta', math.nan):6.1f} "
-          f" mask {values['mask']:.3f}  {rate:8.0f} rays/s  {left / 60:5.1f} min left", flush=True)
-    with open(log_path, "a") as file:
-        file.write(json.dumps(dict(step=step, seconds=seconds, dropped=dropped) | values) + "\n")
-    for name, (low, high, meaning) in HEALTH.items() if progress > 1 / 3 else ():
-        if name in values and name not in warned and not low <= values[name] <= high:
-            warned.add(name)
-            print(f"  warning: {name} is {values[name]:.3g}: {meaning}")
+@torch.no_grad()
+def report(model, path: Path, progress: float, state: dict, terms: dict) -> None:
+    """A line on the terminal and one in log.jsonl. psnr and opacity: of 1,024 fixed rays."""
+    gen = torch.Generator(model.scene.c2w.device).manual_seed(0)
+    rays, _ = random_rays(model.scene, model.scene.photos(False), 1024, 64, gen)
+    out = model.render(rays, model.codes()[rays.img])
+    line = {k: state[k] for k in ("step", "seconds", "dropped")}
+    line |= dict(energy_wh=state["joules"] and state["joules"] / 3600,
+                 psnr=psnr(out["rgb"], rays.rgb))
+    more = dict(zeta=model.deviation(), opacity=out["opacity"]) if hasattr(model, "sdf") else {}
+    line |= {k: v.mean().item() for k, v in (terms | more).items()}
+    rate = state["step"] * model.cfg.rays / state["seconds"]
+    left = state["seconds"] * (1 / max(progress, 1e-3) - 1) / 60
+    shown = "".join(f"  {k} {line[k]:.3g}" for k in ("psnr", "zeta", "mask") if k in line)
+    print(f"  step {state['step']:6d}{shown}  {rate:.0f} rays/s  {left:.1f} min left", flush=True)
+    if not RANK:
+        with open(path, "a") as file:
+            file.write(json.dumps(line) + "\n")
 
 
-# ---- 11 Scoring, mesh, pictures ------------------------------------------------------------------
+# ---- 10 Scoring, mesh, pictures ------------------------------------------------------------------
 
-def psnr(a: np.ndarray, b: np.ndarray) -> float:
-    """Peak signal-to-noise ratio in dB of two uint8 pictures."""
-    mse = ((a.astype(np.float64) - b) ** 2).mean()
-    return -10 * math.log10(max(mse / 255 ** 2, 1e-10))
+def to_uint8(picture: np.ndarray) -> np.ndarray:
+    return (picture.clip(0, 1) * 255 + 0.5).astype(np.uint8)
+
+
+def psnr(a, b) -> float:
+    """Peak signal-to-noise ratio in dB of two pictures in 0..1, numpy or torch; at most 100."""
+    return -10 * math.log10(max(float(((a - b) ** 2).mean()), 1e-10))
 
 
 def ssim(a: np.ndarray, b: np.ndarray) -> float | None:
-    """SSIM of two uint8 pictures: Gaussian window of 11 px, sigma 1.5, no border, or None."""
-    if min(a.shape[:2]) < 11:
-        return None
-    return float(structural_similarity(a, b, channel_axis=2, data_range=255, gaussian_weights=True,
-                                       sigma=1.5, use_sample_covariance=False))
-
-
-LPIPS_WEIGHTS = (  # of AlexNet; of the heads, v0.1
-    "https://download.pytorch.org/models/alexnet-owt-7be5be79.pth",
-    "https://raw.githubusercontent.com/richzhang/PerceptualSimilarity/master/"
-    "lpips/weights/v0.1/alex.pth")
-
-
-def lpips_from(trunk: dict, heads: dict):
-    """Learned perceptual distance (Zhang et al. 2018) from weights of AlexNet and of its heads: a
-    function of pictures (B,3,H,W) in 0..1 and others, with the distances (B,)."""
-    shapes = (0, 4, 2), (3, 1, 2), (6, 1, 1), (8, 1, 1), (10, 1, 1)  # place, stride, padding
-    layers = [(trunk[f"features.{at}.weight"], trunk[f"features.{at}.bias"], stride, padding,
-               heads[f"lin{i}.model.1.weight"]) for i, (at, stride, padding) in enumerate(shapes)]
-
-    @torch.no_grad()
-    def distance(a: Tensor, b: Tensor) -> Tensor:
-        mean, std = a.new_tensor([[-0.030, -0.088, -0.188], [0.458, 0.448, 0.450]])[..., None, None]
-        x, total = (torch.cat([a, b]) * 2 - 1 - mean) / std, 0
-        for i, (weight, bias, stride, padding, head) in enumerate(layers):
-            x = F.max_pool2d(x, 3, 2) if i in (1, 2) else x
-            x = F.relu(F.conv2d(x, weight, bias, stride, padding))
-            fa, fb = F.normalize(x, dim=1, eps=1e-10).chunk(2)
-            total = total + ((fa - fb) ** 2 * head).sum(1).mean((1, 2))
-        return total
-    return distance
+    """SSIM of two pictures in 0..1: Gaussian window of 11 px, sigma 1.5, no border, or None."""
+    how = dict(channel_axis=2, data_range=1, gaussian_weights=True, sigma=1.5)
+    return float(structural_similarity(a, b, use_sample_covariance=False, **how)) if min(
+        a.shape[:2]) >= 11 else None
 
 
 def make_lpips(device):
-    """LPIPS with its published weights, or None with one line of reason where they can't be had."""
+    """Learned perceptual distance of two pictures in 0..1 (AlexNet, v0.1), or None with a line."""
     try:
-        return lpips_from(*(torch.hub.load_state_dict_from_url(
-            url, map_location=device, progress=False, weights_only=True) for url in LPIPS_WEIGHTS))
-    except Exception as error:  # no network, or a damaged file: any layer can fail
-        print(f"  lpips is null: its weights could not be downloaded or read ({error})")
+        import lpips
+        net = lpips.LPIPS(net="alex", verbose=False).to(device)
+    except Exception as error:  # not installed, or its weights cannot be fetched
+        print(f"  lpips is null: pip install lpips, with a network for its weights ({error})")
         return None
+    return lambda *pair: net(*(torch.as_tensor(p, device=device, dtype=torch.float32)
+                               .permute(2, 0, 1)[None] * 2 - 1 for p in pair)).item()
 
 
 def half_pixels(scene: Scene, photo: int, left: bool) -> Tensor:
@@ -1628,31 +1231,22 @@ def half_pixels(scene: Scene, photo: int, left: bool) -> Tensor:
     return pixel[(pixel % w < w // 2) == left]
 
 
-def color_errors(model, scene: Scene, photos: Tensor, codes: Tensor, allowed: list[Tensor], n: int,
-                 gen: torch.Generator) -> Tensor:
-    """Rendered less true colours (Bn,3) at n random ones of each photo's allowed pixels."""
-    pixel = [a[torch.randint(len(a), (n,), generator=gen, device=gen.device)] for a in allowed]
-    rays = make_rays(scene, photos.repeat_interleave(n), torch.cat(pixel))
-    return model.render(rays, codes.repeat_interleave(n, 0))["rgb"] - rays.rgb
-
-
-def fit_codes(model, scene: Scene, photos: Tensor, codes: Tensor | None, steps: int, protocol: str,
-              rays_per_photo: int = 64) -> Tensor:
-    """Appearance codes (B,A) of unseen photos (B,): Adam on random rays of the left halves. [D12]
-    Starts from codes, or from the mean code of the training photos. The scene stays untouched."""
-    gen, n = torch.Generator(scene.c2w.device).manual_seed(0), rays_per_photo
-    if codes is None:
-        codes = model.codes()[~scene.is_test].mean(0).expand(len(photos), -1)  # (B,A)
-    codes = codes.detach().to(scene.c2w.device, copy=True).requires_grad_()
+def fit_codes(model, scene: Scene, photos: Tensor, steps: int = 128, n: int = 64) -> Tensor:
+    """Appearance codes (B,A) of unseen photos (B,): Adam on n random rays a step of each left half.
+    [D12] Starts from the mean code of the training photos. The scene stays untouched."""
+    gen = torch.Generator(scene.c2w.device).manual_seed(0)
+    codes = model.codes()[~scene.is_test].mean(0).expand(len(photos), -1)  # (B,A)
+    codes = codes.detach().clone().requires_grad_()
     if codes.numel() == 0:
         return codes
-    sides = (True, False) if protocol == "leaky" else (True,)
-    allowed = [torch.cat([half_pixels(scene, i, side) for side in sides]) for i in photos.tolist()]
+    left = [half_pixels(scene, i, True) for i in photos.tolist()]
     adam = torch.optim.Adam([codes], lr=0.1)
     model.requires_grad_(False)
-    for step in range(steps):
+    for step in tell(range(steps), "fitting the light of held-out photos"):
         adam.param_groups[0]["lr"] = 0.1 * 0.1 ** (step / steps)
-        loss = color_errors(model, scene, photos, codes, allowed, n, gen).abs().mean()
+        pixel = [a[torch.randint(len(a), (n,), generator=gen, device=gen.device)] for a in left]
+        rays = make_rays(scene, photos.repeat_interleave(n), torch.cat(pixel))
+        loss = (model.render(rays, codes.repeat_interleave(n, 0))["rgb"] - rays.rgb).abs().mean()
         adam.zero_grad()
         loss.backward()
         adam.step()
@@ -1660,145 +1254,98 @@ def fit_codes(model, scene: Scene, photos: Tensor, codes: Tensor | None, steps: 
     return codes.detach()
 
 
-def validate(model, scene: Scene, photos: Tensor, codes: Tensor | None) -> tuple[Tensor, float]:
-    """Codes fitted a little further and PSNR, both on left halves of photos (B,): leaks nothing."""
-    codes = fit_codes(model, scene, photos, codes, 20, "half", 32)
-    gen = torch.Generator(scene.c2w.device).manual_seed(1)
-    left = [half_pixels(scene, i, True) for i in photos.tolist()]
-    with torch.no_grad():
-        errors = color_errors(model, scene, photos, codes, left, 256, gen) ** 2  # (256B,3)
-    mse = errors.reshape(len(photos), -1).mean(1).clamp(min=1e-10)  # (B,)
-    return codes, (-10 * torch.log10(mse)).mean().item()
-
-
-RAY_BYTES = 2 ** 20  # memory that a ray takes in rendering: NeRF-W at full size needs 0.6 MiB
-
-
 @torch.no_grad()
-def render_photo(model, scene: Scene, photo: int, code: Tensor,
-                 with_mask: bool = True) -> dict[str, np.ndarray]:
+def render_photo(model, scene: Scene, photo: int, code: Tensor) -> dict[str, np.ndarray]:
     """A photo's view under an appearance code (A,): arrays (H,W,...) by name of render_rays, and
-    `truth` (H,W,3); with a mask also `mask` (H,W), what the method thinks of the real photo."""
+    `truth` (H,W,3)."""
     w, h = scene.wh[photo].tolist()
     img = torch.tensor([photo], device=scene.c2w.device)
     free = torch.cuda.mem_get_info()[0] if img.is_cuda else 0
-    parts, n = [], int(np.clip(free // RAY_BYTES, CHUNK, 2 ** 18))
+    parts, n = [], int(np.clip(free // 2 ** 20, CHUNK, 2 ** 18))  # a ray of NeRF-W: 0.6 MiB
     for pixel in torch.arange(w * h, device=img.device).split(n):
         rays = make_rays(scene, img.expand(len(pixel)), pixel)
-        out = model.render(rays, code.expand(len(pixel), -1))
-        out |= dict(truth=rays.rgb) | (dict(mask=model.mask_of(rays, img)) if with_mask else {})
+        out = model.render(rays, code.expand(len(pixel), -1)) | dict(truth=rays.rgb)
         parts.append({k: v for k, v in out.items() if v[0].numel() in (1, 3)})  # not the samples'
-    whole = {k: torch.cat([p[k] for p in parts]).float().cpu().numpy() for k in parts[0]}
+    whole = {k: torch.cat([p[k] for p in parts]).cpu().numpy() for k in parts[0]}
     return {k: v.reshape(h, w, *v.shape[1:]) for k, v in whole.items()}
 
 
-def to_uint8(picture: np.ndarray) -> np.ndarray:
-    return (picture.clip(0, 1) * 255 + 0.5).astype(np.uint8)
-
-
-def score(frame: dict[str, np.ndarray], lpips, device) -> dict:
-    """The right half of a rendered photo [D12] against the truth, beside two trivial predictors."""
+def score(frame: dict[str, np.ndarray], lpips=None) -> dict:
+    """The right half of a rendered photo [D12] against the truth, both rounded to 8 bits, beside
+    the trivial predictor: the mean colour of each row of the left half."""
     half = frame["rgb"].shape[1] // 2
-    got, want = to_uint8(frame["rgb"])[:, half:], to_uint8(frame["truth"])[:, half:]
-    left = frame["truth"][:, :half]  # its mean colours, row by row, are the trivial predictor
-    flat = np.broadcast_to(to_uint8(left.mean(1, keepdims=True)), want.shape)
-    mean = np.broadcast_to(flat.mean((0, 1)).round(), want.shape)
-    row = dict(psnr=psnr(got, want), psnr_floor=psnr(flat, want), psnr_mean_color=psnr(mean, want),
-               ssim=ssim(got, want), lpips=None)
-    if lpips is not None and min(got.shape[:2]) >= 32:
-        pair = [torch.as_tensor(p, device=device).permute(2, 0, 1)[None] / 255 for p in (got, want)]
-        row["lpips"] = lpips(*pair).item()
-    return row
+    flat = np.broadcast_to(frame["truth"][:, :half].mean(1, keepdims=True), frame["truth"].shape)
+    got, want, flat = (to_uint8(p)[:, half:] / 255 for p in (frame["rgb"], frame["truth"], flat))
+    return dict(psnr=psnr(got, want), psnr_floor=psnr(flat, want), ssim=ssim(got, want),
+                lpips=lpips(got, want) if lpips and min(got.shape[:2]) >= 32 else None)
 
 
-def summary(rows: list[dict], key: str) -> tuple[float | None, float | None]:
-    """Mean and spread (standard deviation) over rows of a figure; None if no row has it."""
-    values = [row[key] for row in rows if row.get(key) is not None]
-    return (float(np.mean(values)), float(np.std(values))) if values else (None, None)
-
-
-def evaluate(model, scene: Scene, cfg: Config, lpips) -> dict:
-    """Scores of the test photos by the half-image protocol [D12], per photo and on average."""
-    photos, rows, frames, seconds = scene.photos(True), [], [], []  # (B,)
-    codes = fit_codes(model, scene, photos, None, 128, cfg.protocol) if len(photos) else []  # (B,A)
-    for photo, code in zip(photos.tolist(), codes):
-        begin = time.perf_counter()
-        name = str(scene.raw["name"][photo])
-        frame = render_photo(model, scene, photo, code, hasattr(model, "cgnet"))
-        seconds.append(time.perf_counter() - begin)
-        rows.append(dict(name=name) | score(frame, lpips, scene.c2w.device))
-        frames += [(name, frame)] if len(frames) < 3 else []  # for the panel
-    keys = ("psnr", "psnr_floor", "psnr_mean_color", "ssim", "lpips")
-    fps = 1 / float(np.median(seconds)) if seconds else None
-    means = {k: summary(rows, k)[0] for k in keys}
-    return means | dict(per_image=rows, frames_per_second=fps, frames=frames)
+def evaluate(model, scene: Scene, lpips=None) -> dict:
+    """Scores of the test photos by the half-image protocol [D12], per photo and on average, None
+    where there are none; the first frames, (photo, name, frame), for the panel."""
+    photos, rows, frames, means = scene.photos(True), [], [], {}  # (B,)
+    codes = fit_codes(model, scene, photos) if len(photos) else []  # (B,A)
+    for i, code in tell(list(zip(photos.tolist(), codes)), "scoring held-out photos"):
+        frame, name = render_photo(model, scene, i, code), str(scene.raw["name"][i])
+        rows.append(dict(name=name) | score(frame, lpips))
+        frames += [(i, f"held out: {name}", frame)] if len(frames) < 2 else []
+    for key in ("psnr", "psnr_floor", "ssim", "lpips"):
+        values = [row[key] for row in rows if row[key] is not None]
+        means[key] = float(np.mean(values)) if values else None
+    return means | dict(per_image=rows, frames=frames)
 
 
 @torch.no_grad()
 def toy_truth(model, scene: Scene) -> dict:
-    """What only a synthetic scene can tell; None where the model has no such part. sdf_error: mean
-    |s - s_true| within 0.05 of visible surfaces, scene units. mask_iou, _static: M > 0.5 against
-    the true occluders over every fifth training pixel, and mean M on all others."""
-    raw, dev = scene.raw, scene.c2w.device
-    found = dict.fromkeys(("sdf_error", "mask_iou", "mask_static"))
-    has_sdf, surface, mask, occluder = hasattr(model, "sdf"), [], [], []
+    """What only a synthetic scene can tell. sdf_error: mean |s - s_true| within 0.05 of visible
+    surfaces, scene units. mask_iou, _static: M > 0.5 against the true occluders over every fifth
+    training pixel, and mean M on all others; None without a mask."""
+    raw, info, surface, mask, occluder = scene.raw, scene.info, [], [], []
     for i in scene.photos(False)[:, None]:
-        span = slice(*scene.start[int(i):int(i) + 2].tolist())
-        pixel = torch.arange(0, span.stop - span.start, 5, device=dev)  # (R,)
-        rays = make_rays(scene, i.expand(len(pixel)), pixel)
-        depth = torch.as_tensor(raw["depth"][span][::5]).to(dev, torch.float32)  # (R,)
-        if has_sdf:
-            surface.append(rays.at(depth[:, None])[depth.isfinite()][:, 0])  # (P,3)
-        if model.use_mask:
-            mask.append(model.mask_of(rays, i).cpu())
-            occluder.append(torch.as_tensor(raw["occluder"][span][::5]))
-    if has_sdf:
-        x, gen = torch.cat(surface), torch.Generator().manual_seed(0)
-        x = x + 0.02 * torch.randn(x.shape, generator=gen).to(dev)  # (P,3) around the true surface
-        x = x[x.norm(dim=1) < 1]
-        x_file = x.cpu().numpy() * raw["scale"] + raw["center"]
-        true = torch.as_tensor(data_prep.toy_sdf(x_file, scene.info["background"]) / raw["scale"])
-        s = torch.cat([model.sdf(part)[0] for part in x.split(CHUNK)]).cpu()  # (P,)
-        found["sdf_error"] = (s - true)[true.abs() < 0.05].abs().mean().item()
-    if model.use_mask:
-        mask, occluder = torch.cat(mask), torch.cat(occluder)
-        both, union = (mask > 0.5) & occluder, (mask > 0.5) | occluder
-        found["mask_iou"] = both.sum().item() / union.sum().item() if union.any() else None
-        found["mask_static"] = mask[~occluder].mean().item()
-    return found
+        first, last = scene.start[int(i):int(i) + 2].tolist()
+        rays = make_rays(scene, i, torch.arange(0, last - first, 5, device=i.device))
+        depth = torch.as_tensor(raw["depth"][first:last:5]).to(i.device, torch.float32)  # (R,)
+        surface.append(rays.at(depth[:, None])[depth.isfinite()][:, 0])  # (P,3)
+        mask.append(mask_at(model.mask.look(i), rays.uv).cpu().numpy())
+        occluder.append(raw["occluder"][first:last:5])
+    x, gen = torch.cat(surface), torch.Generator().manual_seed(0)
+    x = x + 0.02 * torch.randn(x.shape, generator=gen).to(x.device)  # (P,3) around the surface
+    x = x[x.norm(dim=1) < 1]
+    true = data_prep.toy_sdf(x.cpu().numpy() * raw["scale"] + raw["center"],
+                             info["background"], info["landmark"]) / raw["scale"]  # (P,)
+    s = torch.cat([model.distance(part) for part in x.split(CHUNK)]).cpu().numpy()  # (P,)
+    error = float(np.abs(s - true)[np.abs(true) < 0.05].mean())
+    mask, occluder = np.concatenate(mask), np.concatenate(occluder)
+    both, union = ((mask > 0.5) & occluder).sum(), ((mask > 0.5) | occluder).sum()
+    has_mask, has_people = model.mask.is_on, occluder.any()
+    return dict(sdf_error=error, mask_iou=float(both / union) if has_mask and has_people else None,
+                mask_static=float(mask[~occluder].mean()) if has_mask else None)
 
 
 @torch.no_grad()
 def extract_mesh(model: GeoNVS, resolution: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The surface s = 0 inside the unit sphere: vertices (N,3) in SfM units, faces (M,3), uint8
     colours (N,3), by marching cubes over `resolution` cells (default: two per finest octree cell,
-    at most 512). Only corners are evaluated that are near the surface by the cached SDF."""
-    scene, octree, cache = model.scene, model.sdf.octree, model.cache
-    n = resolution or min(2 * octree.resolution(octree.active - 1), 512)
+    at most 512). Only corners near the surface are evaluated; elsewhere the cache has the sign."""
+    scene, cache = model.scene, model.cache.volume
+    n = resolution or min(round(2 / model.eps), 512)
     line = torch.linspace(-1, 1, n + 1, device=cache.device)
-    cached = F.interpolate(cache, size=(n + 1,) * 3, mode="trilinear", align_corners=True)[0, 0]
+    volume = F.interpolate(cache, size=(n + 1,) * 3, mode="trilinear", align_corners=True)[0, 0]
     is_inside = line[:, None, None] ** 2 + line[:, None] ** 2 + line ** 2 < 1  # (n+1,n+1,n+1)
-    near = (cached.abs() < 6 / cache.shape[-1]) & is_inside  # (n+1,n+1,n+1)
-    volume = torch.ones_like(cached)
-    for index in torch.nonzero(near).split(2 ** 16) if near.any() else ():  # (P,3)
-        volume[tuple(index.T)] = model.sdf(index * (2 / n) - 1.0)[0]
-    cubes = []
-    for slab in (slice(i, i + 65) for i in range(0, n, 64)):  # all at once would take gigabytes
-        far, high, low = (F.max_pool3d(v[None], 2, 1)[0]
-                          for v in (-near[slab].float(), volume[slab], -volume[slab]))
-        cubes.append((far < 0) & (high > 0) & (low >= 0))  # corners evaluated, s changes sign
-    cubes = F.pad(torch.cat(cubes), (1, 0) * 3)  # skimage looks a cube up at its last corner
-    if not cubes.any():
+    near = torch.nonzero((volume.abs() < 6 / cache.shape[-1]) & is_inside)  # (P,3)
+    for index in tell(near.split(2 ** 16), "meshing"):
+        volume[tuple(index.T)] = model.distance(index * (2 / n) - 1.0)
+    volume[~is_inside] = 1.0
+    if not (volume < 0).any():
         return np.zeros((0, 3)), np.zeros((0, 3), int), np.zeros((0, 3), np.uint8)
-    vertices, faces, _, _ = marching_cubes(volume.cpu().numpy(), 0, mask=cubes.cpu().numpy(),
-                                           gradient_direction="descent")
+    vertices, faces, _, _ = marching_cubes(volume.cpu().numpy(), 0, gradient_direction="descent")
     x = torch.as_tensor(vertices * (2 / n) - 1, dtype=torch.float32, device=line.device)  # (N,3)
     code, colors = model.codes()[~scene.is_test].mean(0), []  # (A,)
     for part in x.split(2 ** 16):
-        _, geo, grad = model.sdf.with_gradient(part)
+        _, geo, grad = model.sdf(part, True)
         normal = F.normalize(grad, dim=1)
-        inputs = torch.cat([geo, normal, sh_basis(-normal), code.expand(len(part), -1)], 1)
-        colors.append(torch.sigmoid(model.color(inputs)))
+        inputs = [geo, normal, direction_basis(-normal), code.expand(len(part), -1)]
+        colors.append(model.color(torch.cat(inputs, 1)).sigmoid())
     vertices = x.cpu().numpy() * scene.raw["scale"] + scene.raw["center"]
     return vertices, faces, to_uint8(torch.cat(colors).cpu().numpy())
 
@@ -1816,554 +1363,188 @@ def write_ply(path: Path, vertices: np.ndarray, faces: np.ndarray, colors: np.nd
     atomic_write(path, lambda tmp: Path(tmp).write_bytes(data))
 
 
-def write_png(path: Path, picture: np.ndarray) -> None:
-    """RGB uint8 picture to a file."""
-    atomic_write(path, lambda tmp: cv2.imwrite(str(tmp), picture[:, :, ::-1]))
-
-
-def colormap(value: np.ndarray, low: float, high: float) -> np.ndarray:
-    """(H,W) to RGB by viridis between low and high."""
-    grey = to_uint8((value - low) / max(high - low, 1e-9))
-    return cv2.applyColorMap(grey, cv2.COLORMAP_VIRIDIS)[:, :, ::-1]
-
-
-def tiles_of(model, f: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """A rendered photo's pictures (H,W,3) uint8 by title."""
-    mask = f.get("mask", np.zeros_like(f["depth"]))  # baselines have none for held-out photos
-    tiles = {"photo": to_uint8(f["truth"]), "render": to_uint8(f["rgb"]),
-             "mask M": colormap(mask, 0, 1)}
-    if "normal" in f:
-        cfg, errors = model.cfg, [torch.as_tensor(f[k]) for k in ("e_grad", "e_curv")]
-        calibration = model.calibration.cpu() if cfg.gpl == "calibrated" else None
-        phi = edge_indicator(*errors, cfg.lam_grad, cfg.lam_lap, calibration).numpy()
-        tiles["geometry map"] = colormap(f["opacity"] * phi, 0, 1)
-    tiles["depth"] = colormap(1 / f["depth"], *np.quantile(1 / f["depth"], (0.02, 0.98)))
-    if "normal" in f:
-        tiles["normals"] = to_uint8(f["normal"] / 2 + 0.5)
-    return tiles
-
-
-def panel(model, frames: list[tuple[str, dict]], height: int = 180) -> np.ndarray:
-    """The paper's Fig. 2: a row per photo; photo, render, mask, geometry map, depth, normals."""
-    widths = [round(f["rgb"].shape[1] * height / f["rgb"].shape[0]) for _, f in frames]
+def panel(model, frames: list[tuple[int, str, dict]], width: int = 240) -> np.ndarray:
+    """A row for each photo, (number, name, rendered frame): photo, render, and of our model the
+    normals of the surface and what the mask network says of the photo."""
     rows = []
-
-    def write(picture, text, at, size, color):
-        cv2.putText(picture, text, at, cv2.FONT_HERSHEY_SIMPLEX, size, color, 1, cv2.LINE_AA)
-    for (name, f), w in zip(frames, widths):
-        how = cv2.INTER_AREA if w < f["rgb"].shape[1] else cv2.INTER_CUBIC
-        tiles = {title: cv2.resize(tile, (w, height), interpolation=how)
-                 for title, tile in tiles_of(model, f).items()}
-        rows.append(np.concatenate([
-            np.pad(tile, ((2, 2), (2, 2 + max(widths) - w), (0, 0)), constant_values=255)
-            for tile in tiles.values()], 1))
-        write(rows[-1], name, (6, height - 4), 0.36, (255, 255, 255))
-    head = np.full((20, rows[0].shape[1], 3), 255, np.uint8)
-    for i, title in enumerate(tiles):
-        write(head, title, (6 + i * (max(widths) + 4), 14), 0.45, (0, 0, 0))
-    return np.concatenate([head, *rows])
+    for i, name, f in frames:
+        row, tiles = [], {name: f["truth"], "render": f["rgb"]}
+        if hasattr(model, "sdf"):
+            M = to_uint8(model.mask.look([i])[0, 0].sigmoid().detach().cpu().numpy())  # (m,m)
+            M = cv2.applyColorMap(M, cv2.COLORMAP_VIRIDIS)[:, :, ::-1] / 255  # (m,m,3)
+            tiles |= {"normals": f["normal"] / 2 + 0.5, "mask: yellow is transient": M}
+        height = round(width * f["rgb"].shape[0] / f["rgb"].shape[1])
+        for title, tile in tiles.items():
+            tile = cv2.resize(to_uint8(tile), (width, height), interpolation=cv2.INTER_AREA)
+            row.append(np.pad(tile, ((20, 4), (0, 4), (0, 0)), constant_values=255))
+            cv2.putText(row[-1], title, (2, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.4, (0, 0, 0), 1, 16)
+        rows.append(np.concatenate(row, 1))
+    return np.concatenate(rows)
 
 
-def finish(model, scene: Scene, cfg: Config, state: dict, energy: dict, run: Path) -> dict:
+def finish(model, scene: Scene, state: dict, run: Path) -> dict:
     """Scores a trained model and writes metrics.json, panel.png and mesh.ply below run."""
-    is_gpu = scene.c2w.is_cuda
-    peak = torch.cuda.max_memory_allocated() if is_gpu else None  # of training, not of scoring
-    scores = evaluate(model, scene, cfg, make_lpips(scene.c2w.device))
-    frames = [(f"held out: {name}", frame) for name, frame in scores.pop("frames")]
+    cfg, is_gpu, octrees = model.cfg, scene.c2w.is_cuda, octrees_of(model)
+    cpu = f"cpu, {torch.get_num_threads()} threads"
+    unit = 1 if sys.platform == "darwin" else 1024  # of ru_maxrss
+    peak = (torch.cuda.max_memory_allocated() if is_gpu else  # of training, not of scoring
+            resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit)
+    scores = evaluate(model, scene, make_lpips(scene.c2w.device))
     busy = scene.photos(False)
-    if hasattr(model, "logits"):  # training photos with most on the mask
-        busy = busy[model.logits[busy].sigmoid().mean((1, 2, 3)).argsort(descending=True)]
-    for i in busy[:2].tolist():
-        frame = render_photo(model, scene, i, model.codes()[i])
-        frames.append((f"training: {scene.raw['name'][i]}", frame))
-    write_png(run / "panel.png", panel(model, frames))
-    if hasattr(model, "sdf"):
+    if hasattr(model, "sdf"):  # training photos with most on the mask
+        share = model.mask.logits[busy].sigmoid().mean((1, 2, 3))
+        busy = busy[share.argsort(descending=True)]
         write_ply(run / "mesh.ply", *extract_mesh(model))
-    octrees, cpu = model.octrees(), f"cpu, {torch.get_num_threads()} threads"
-    structure = sum(o.bytes() - 4 * o.features.numel() for o in octrees)
+    frames = [(i, f"training: {scene.raw['name'][i]}",
+               render_photo(model, scene, i, model.codes()[i])) for i in busy[:2].tolist()]
+    picture = panel(model, frames + scores.pop("frames"))[:, :, ::-1]
+    atomic_write(run / "panel.png", lambda tmp: cv2.imwrite(str(tmp), picture))
     git = ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short", "HEAD"]
-    fitted = "left half" if cfg.protocol == "half" else "WHOLE photo (leaky)"
     metrics = dict(
-        scene=scene.info["scene"], method=cfg.method, seed=cfg.seed, steps=state["step"],
-        device=torch.cuda.get_device_name() if is_gpu else cpu,
-        **scores, train_seconds=state["seconds"], **energy,
-        curve=state["curve"], dropped=state["dropped"], processes=RANKS,
+        scene=scene.info["scene"], method=model.name, seed=cfg.seed, steps=state["step"],
+        device=torch.cuda.get_device_name() if is_gpu else cpu, **scores,
+        train_seconds=state["seconds"], dropped=state["dropped"],
+        energy_wh=state["joules"] and state["joules"] / 3600, energy_source=state["source"],
         rays_per_second=state["step"] * cfg.rays / max(state["seconds"], 1e-9),
         parameters=sum(p.numel() for p in model.parameters()),
         octree_cells=[len(c) for o in octrees[:1] for c in o.cells] or None,
         octree_bytes=octrees[0].bytes() if octrees else None,
-        model_bytes=sum(p.numel() * p.element_size() for p in model.parameters()) + structure,
-        peak_memory_bytes=peak if is_gpu else peak_rss(),
-        protocol=f"appearance fitted on the {fitted}, scored on the right half",
-        torch=torch.__version__, python=sys.version.split()[0], config=asdict(cfg),
+        model_bytes=sum(p.numel() * 4 for p in model.parameters()) + sum(
+            o.bytes() - 4 * o.features.numel() for o in octrees),
+        peak_memory_bytes=peak, torch=torch.__version__, config=asdict(cfg),
+        protocol="appearance fitted on the left half, scored on the right half",
         commit=shutil.which("git") and subprocess.run(
             git, capture_output=True, text=True).stdout.strip() or None)
-    if scene.info["kind"] == "toy":
+    if scene.info["kind"] == "toy" and hasattr(model, "sdf"):
         metrics |= toy_truth(model, scene)
-    write_text(run / "metrics.json", json.dumps(metrics, indent=1))
+    text = json.dumps(metrics, indent=1)
+    atomic_write(run / "metrics.json", lambda tmp: Path(tmp).write_text(text))
     return metrics
 
 
-def camera_path(c2w: Tensor, count: int, keys: int = 6) -> Tensor:
-    """A smooth path (count,3,4) through cameras (B,3,4), along the axis on which they spread."""
-    centre = c2w[:, :, 3] - c2w[:, :, 3].mean(0)  # (B,3)
-    order = (centre @ torch.linalg.svd(centre)[2][0]).argsort()  # (B,)
-    stops = torch.linspace(0, len(order) - 1, min(keys, len(order))).round().long()
-    stops = c2w[order[stops]]  # (keys,3,4)
-    u = torch.linspace(0, len(stops) - 1 - 1e-4, count)  # (count,)
-    i = u.long()
-    f = (u - i)[:, None, None].to(c2w)
-    f = f * f * (3 - 2 * f)  # rests at every key
-    path = torch.lerp(stops[i], stops[(i + 1).clamp(max=len(stops) - 1)], f)  # (count,3,4)
-    left, _, right = torch.linalg.svd(path[:, :, :3])  # the nearest rotation
-    return torch.cat([left @ right, path[:, :, 3:]], 2)
-
-
-def film(model, scene: Scene, kind: str, path: Path, count: int = 72) -> None:
-    """mp4 at 24 frames/s: a path through the training cameras, or one view in all appearances."""
-    photos = scene.photos(False)
+def film(model, scene: Scene, path: Path, rays: float = 4e6) -> None:
+    """mp4 at 24 frames/s: a path through the training cameras, from one end to the other, then one
+    view through the photos' lights. Frames are as large as photos, or as so many rays allow."""
+    photos, count = scene.photos(False), 48
     c2w, codes = scene.c2w[photos], model.codes()[photos]
-    centre = c2w[:, :, 3].mean(0)
-    view = photos[(c2w[:, :, 3] - centre).norm(dim=1).argmin()].item()  # the middle one
-    w, h = (scene.wh[view] // 2 * 2).tolist()
-    if kind == "orbit":
-        poses, codes = camera_path(c2w, count), codes.mean(0).expand(count, -1)
-    else:
-        need(codes.numel(), "this run has no appearance codes: --render orbit shows what it has")
-        u = torch.linspace(0, len(photos) - 1.001, count)[:, None].to(codes)
-        i = u[:, 0].long()
-        codes = torch.lerp(codes[i], codes[i + 1], u % 1)
-        poses = scene.c2w[view].expand(count, 3, 4)
+    centre = c2w[:, :, 3] - c2w[:, :, 3].mean(0)  # (B,3)
+    order = (centre @ torch.linalg.svd(centre)[2][0]).argsort()  # along the axis of their spread
+    view = photos[centre.norm(dim=1).argmin()].item()  # the middle one
+
+    def between(keys):  # smoothly from key to key
+        u = torch.linspace(0, len(keys) - 1, count, device=keys.device)
+        i, f = u.long(), (u % 1).reshape(-1, *[1] * (keys.dim() - 1))
+        after = keys[(i + 1).clamp(max=len(keys) - 1)]
+        return torch.lerp(keys[i], after, f * f * (3 - 2 * f))
+    poses = between(c2w[order[::max(1, len(order) // 6)]])  # (count,3,4)
+    left, _, right = torch.linalg.svd(poses[:, :, :3])
+    poses[:, :, :3] = left @ right  # the nearest rotation
+    shots = [(pose, codes.mean(0)) for pose in poses]
+    shots += [(c2w[photos == view][0], code) for code in between(codes)] if codes.numel() else []
+    budget = rays * (50 if codes.is_cuda else 1) / len(shots) / scene.wh[view].prod().item()
+    wh, K, scale = scene.wh.clone(), scene.K.clone(), min(1.0, math.sqrt(budget))
+    wh[view], K[view] = (wh[view] * scale / 2).long() * 2, K[view] * scale  # even, for the codec
 
     def write(tmp):
-        video = cv2.VideoWriter(str(tmp), cv2.VideoWriter_fourcc(*"mp4v"), 24, (w, h))
+        video = cv2.VideoWriter(str(tmp), cv2.VideoWriter_fourcc(*"mp4v"), 24, wh[view].tolist())
         if not video.isOpened():
             raise OSError("OpenCV cannot write mp4 here")
-        for pose, code in zip(poses, codes):
+        for pose, code in tell(shots, f"filming {len(shots)} frames"):
             moved = scene.c2w.clone()
             moved[view] = pose
-            frame = render_photo(model, scene._replace(c2w=moved), view, code, False)["rgb"]
-            video.write(np.ascontiguousarray(to_uint8(frame)[:h, :w, ::-1]))
+            frame = render_photo(model, scene._replace(c2w=moved, wh=wh, K=K), view, code)["rgb"]
+            video.write(np.ascontiguousarray(to_uint8(frame)[:, :, ::-1]))
         video.release()
     atomic_write(path, write)
     print(f"wrote {path}")
 
 
-def peak_rss() -> int | None:
-    """Largest resident memory of this process, bytes; None where several runs share a process."""
-    if parent_process():
-        return None
-    import resource  # absent on Windows
-    unit = 1 if sys.platform == "darwin" else 1024
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
-
-
-# ---- 12 Experiments: speed against accuracy, what each piece buys, where methods fail ------------
-
-PIECES = {  # of the method, one changed at a time
-    "full": {}, "no GPL": dict(lam_gpl=0.0), "literal GPL": dict(gpl="literal"),
-    "no mask": dict(mask="off"), "no appearance": dict(appearance="off"),
-    "no SfM term": dict(lam_sfm=0.0), "no background": dict(background="off"),
-    "no curvature": dict(lam_curv=0.0), "no Lipschitz": dict(lam_lps=0.0),
-    "uniform sampling": dict(sampling="uniform"), "printed alpha": dict(alpha="printed"),
-    "finite differences": dict(normals="fd"), "uniform grid": dict(grid="uniform"),
-    "half depth": dict(levels=-1), "double depth": dict(levels=1),  # so many more levels
-}
-RIVALS = {method + how: dict(method=method, tuned=bool(how))
-          for method in ("geonvsw", "nerfw", "hanerf") for how in ("", " tuned")}
-FRONT = {f"{rays} rays x {n} samples": dict(rays=rays, samples=n, bg_samples=n)
-         for rays in (256, 512, 1024) for n in (8, 16, 24)}
-FRONT |= {f"512 x 16, {k}": PIECES[k] for k in ("half depth", "double depth")}
-CALM = dict(occluders=0.2, exposure=1.0, photos=24, pose_noise=0.0, amp="off")  # of a 64 px toy,
-STRESS = {  # and one knob turned at a time
-    "occluders": (0.0, 0.2, 0.4, 0.6), "exposure": (0.0, 1.0, 2.0), "photos": (6, 24, 48),
-    "pose_noise": (0.0, 1.0, 4.0), "amp": ("off", "on")}
-KNOB_UNITS = dict(occluders="share of occluders", exposure="exposure spread", amp="half precision",
-                  photos="training photos", pose_noise="pose noise, px")
-SMALL = dict(steps=300, rays=256, mask_px=64, mask_every=2, bg_samples=8)  # half a minute each
-STRESS_METHODS = {piece: PIECES[piece] | SMALL for piece in
-                  ("full", "no GPL", "literal GPL", "no mask", "no appearance")}
-STRESS_METHODS |= {method: RIVALS[f"{method} tuned"] | dict(minutes=0.5)
-                   for method in ("nerfw", "hanerf")}
-COLORS = "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#999999"
-FIGURES = ("psnr", "psnr_floor", "ssim", "sdf_error", "mask_iou", "mask_static", "octree_bytes",
-           "rays_per_second", "train_seconds", "energy_wh", "parameters")
-
-
-def read_metrics(run: Path) -> dict:
-    path = run / "metrics.json"
-    need(path.exists(), f"{run} holds no metrics.json: give folders of finished runs")
-    try:
-        metrics = json.loads(path.read_text())
-        has_score = "failed" in metrics or metrics["psnr"] is not None
-    except (ValueError, KeyError, TypeError):
-        raise UserError(f"{path} is damaged or not of this program: train that run again") from None
-    need(has_score, f"{run} has no scores, as its scene holds no photos out: see README")
-    return metrics
-
-
-def run_once(given: dict, run: Path) -> dict:
-    """Metrics of one training; given may hold "toy", knobs of make_toy. What it prints goes to
-    log.txt. A finished run of the same settings is read; one that diverged is a result, too."""
-    toy, given = given.get("toy"), {k: v for k, v in given.items() if k != "toy"}
-    cfg = make_config(given)
-    done, source = run / "metrics.json", scene_file(cfg)
-    is_newer = done.exists() and source.exists() and source.stat().st_mtime > done.stat().st_mtime
-    if not done.exists() or is_newer and not toy or read_metrics(run)["config"] != asdict(cfg):
-        run.mkdir(parents=True, exist_ok=True)
-        with open(run / "log.txt", "w") as log, contextlib.redirect_stdout(log):
-            try:
-                execute(cfg, data_prep.make_toy(**toy) if toy else find_scene(cfg), run)
-            except Diverged as error:
-                write_text(run / "metrics.json", json.dumps(
-                    dict(failed=str(error), method=cfg.method, curve=[], config=asdict(cfg))))
-    metrics = read_metrics(run)
-    said = metrics.get("failed") or "{psnr:.2f} dB, {train_seconds:.0f} s".format(**metrics)
-    print(f"{run}: {said}", flush=True)
-    return metrics
-
-
-def matrix(kind: str, rows: dict[str, dict], given: dict, seeds: int, workers: int = 1) -> dict:
-    """Metrics, a list over seeds, of every row (settings by name, levels relative to the scene's).
-    workers: CPU processes that train side by side, a thread each, which is faster than one after
-    the other with all threads."""
-    cfg = make_config(given)
-    scene, folder = find_scene(cfg), Path("runs") / kind  # made once, before processes start
-    need(scene["is_test"].any(), "experiments need held-out photos: give a split file, see README")
-    levels, jobs = cfg.levels or levels_for_footprint(float(scene["footprint"])), []
-    for (name, row), seed in itertools.product(rows.items(), range(seeds)):
-        deeper = {"levels": max(1, levels + row["levels"])} if "levels" in row else {}
-        jobs.append((given | row | deeper | dict(seed=seed),
-                     folder / f"{name}-{seed}".replace(" ", "_")))
-    for job, _ in jobs:  # a row that cannot work is refused before the first is run
-        check(make_config({k: v for k, v in job.items() if k != "toy"}))
-    if workers == 1:
-        done = [run_once(*job) for job in jobs]
-    else:
-        with ProcessPoolExecutor(workers, get_context("spawn"), torch.set_num_threads, [1]) as pool:
-            done = list(pool.map(run_once, *zip(*jobs)))
-    return {name: done[i * seeds:(i + 1) * seeds] for i, name in enumerate(rows)}
-
-
-def table_line(name: dict, metrics: list[dict]) -> dict:
-    """A line of a table: mean and spread over seeds. Failures, runs that diverged or ended below a
-    picture of one colour, are counted in a column of their own."""
-    cells = [m["octree_cells"] for m in metrics if m.get("octree_cells")]
-    failures = sum("failed" in m or m["psnr"] < m["psnr_mean_color"] for m in metrics)
-    line = name | dict(runs=len(metrics), failures=failures,
-                       cells=float(np.mean([sum(c) for c in cells])) if cells else None)
-    pairs = ((key, summary(metrics, key)) for key in FIGURES)
-    return line | {k: v for key, pair in pairs for k, v in zip((key, key + "_std"), pair)}
-
-
-def plotting():
-    try:
-        import matplotlib.pyplot as plt
-    except ImportError:
-        raise UserError("charts need matplotlib: pip install matplotlib") from None
-    plt.switch_backend("Agg")
-    return plt
-
-
-def publish(kind: str, rows: list[dict], figure) -> None:
-    """<kind>.csv of rows with the same keys, where None stays empty, and <kind>.png."""
-    text = io.StringIO()
-    cells = [[f"{v:.5g}" if isinstance(v, float) else v for v in row.values()] for row in rows]
-    csv.writer(text, lineterminator="\n").writerows([list(rows[0]), *cells])
-    write_text(Path(f"{kind}.csv"), text.getvalue())
-    atomic_write(Path(f"{kind}.png"), lambda tmp: figure.savefig(tmp, dpi=110, bbox_inches="tight"))
-    print(f"wrote {kind}.csv and {kind}.png")
-
-
-def reached(curve: list[dict], level: float, unit: str) -> float | None:
-    """Seconds or watt-hours at which a curve first reaches a PSNR, log-interpolated, or None."""
-    for a, b in zip([None] + curve, curve):
-        if b["psnr"] >= level and b[unit] is not None:
-            if a is None or b["psnr"] == a["psnr"]:
-                return b[unit]
-            f = (level - a["psnr"]) / (b["psnr"] - a["psnr"])
-            return a[unit] ** (1 - f) * b[unit] ** f
-    return None
-
-
-def pareto(points: list[tuple]) -> list[tuple]:
-    """Of points (cost, quality) those that no other beats at the same cost or less."""
-    return [(x, y) for x, y in points if not any(a <= x and b > y for a, b in points)]
-
-
-def plot_curves(axis, groups: dict[str, list[dict]], unit: str, xlabel: str) -> None:
-    """PSNR over seconds or watt-hours: mean and range over seeds; rings mark the Pareto front."""
-    points = []
-    for i, (name, metrics) in enumerate(groups.items()):
-        curves = [m["curve"] for m in metrics if m["curve"]]
-        n = min(map(len, curves), default=0)
-        if n and all(point[unit] is not None for c in curves for point in c):
-            x, y = (np.array([[p[k] for p in c[:n]] for c in curves]) for k in (unit, "psnr"))
-            style = dict(color=COLORS[i % 8], marker="os^Dv"[i % 5], ls=("-", "--", ":")[i % 3])
-            axis.plot(x.mean(0), y.mean(0), label=f"{name} ({len(curves)} seeds)", ms=4, **style)
-            axis.fill_between(x.mean(0), y.min(0), y.max(0), color=COLORS[i % 8], alpha=0.2)
-            points += zip(x.mean(0), y.mean(0))
-    if points:
-        axis.plot(*zip(*pareto(points)), "o", mfc="none", mec="black", ms=9, label="Pareto front")
-        floor, _ = summary([m for metrics in groups.values() for m in metrics], "psnr_floor")
-        axis.axhline(floor, color="grey", lw=1, label="trivial predictor")
-        axis.set_xscale("log", subs=(2, 5))
-        axis.xaxis.set_major_formatter("{x:g}")
-        axis.xaxis.set_minor_formatter("{x:g}")
-        axis.legend(fontsize=8, ncol=3, loc="upper left", bbox_to_anchor=(0, -0.13))
-    else:
-        axis.text(0.5, 0.5, f"no {unit} in these runs\n(needs --curve\nand a counter)",
-                  ha="center", va="center", transform=axis.transAxes)
-    axis.set(xlabel=xlabel, ylabel="PSNR on held-out left halves, dB")
-    axis.grid(alpha=0.3, which="both")
-
-
-def chart(kind: str, groups: dict[str, list[dict]]) -> None:
-    """<kind>.png: PSNR over seconds and watt-hours, a curve a row; <kind>.csv: the table, with time
-    and energy to PSNR levels, and to where each baseline's better row ends, over what that took."""
-    plt, rows, goals = plotting(), [], {f"{n}dB": dict(psnr=float(n)) for n in range(14, 32)}
-    finished = [m for metrics in groups.values() for m in metrics if "failed" not in m]
-    need(finished, "all of these runs failed: the log.txt of each says why")
-    for rival in ("nerfw", "hanerf"):
-        ends = [[m["curve"][-1] for m in metrics] for name, metrics in groups.items()
-                if name.startswith(rival) and all(m["curve"] for m in metrics)]
-        if ends:
-            best = max(ends, key=lambda points: summary(points, "psnr")[0])
-            goals[f"{rival}_end"] = {k: summary(best, k)[0] for k in ("psnr", "seconds", "wh")}
-    for name, metrics in groups.items():
-        row, curves = table_line(dict(row=name), metrics), [m["curve"] for m in metrics]
-        for unit, (end, goal) in itertools.product(("seconds", "wh"), goals.items()):
-            hits = [reached(curve, goal["psnr"], unit) for curve in curves]
-            row[f"{unit}_to_{end}"] = mean = None if None in hits else float(np.mean(hits))
-            if unit in goal:
-                row[f"{unit}_ratio_{end}"] = mean / goal[unit] if mean and goal[unit] else None
-        rows.append(row)
-    has_energy = any(p["wh"] for m in finished for p in m["curve"])
-    figure, axes = plt.subplots(1, 2, figsize=(12, 4.5), sharey=True,
-                                width_ratios=(1, 1 if has_energy else 0.3))
-    plot_curves(axes[0], groups, "seconds", "training time, s")
-    plot_curves(axes[1], groups, "wh", "energy, Wh")
-    figure.suptitle("{scene}: speed against accuracy ({device})".format(**finished[0]))
-    publish(kind, rows, figure)
-
-
-def ablation(given: dict, seeds: int, workers: int) -> None:
-    """What each piece buys, the octree's depth and shape among them: ablation.csv and png."""
-    plt, cfg = plotting(), make_config(given)
-    groups = matrix(f"ablation-{scene_name(cfg)}", PIECES, given, seeds, workers)
-    table = [table_line(dict(row=name), metrics) for name, metrics in groups.items()]
-    shown = dict(psnr="PSNR, dB", sdf_error="SDF error, radii", mask_iou="mask IoU",
-                 octree_bytes="octree, bytes", rays_per_second="training, rays/s")
-    figure, axes = plt.subplots(1, len(shown), figsize=(15, 0.33 * len(table) + 1), sharey=True)
-    for axis, (key, label) in zip(axes, shown.items()):
-        mean, std = (np.array([r[k] for r in table], float) for k in (key, key + "_std"))
-        axis.barh([r["row"] for r in table], mean, xerr=std, color=COLORS[0])
-        axis.axvline(mean[0], color="black", lw=1)
-        has_low = key == "psnr" and np.isfinite(mean).any()
-        axis.set(xlabel=label, xlim=(np.nanmin(mean) - 1, None) if has_low else None)
-    axes[0].invert_yaxis()
-    figure.suptitle(f"{scene_name(cfg)}: one piece changed at a time, {seeds} seeds")
-    publish("ablation", table, figure)
-
-
-def stress(given: dict, seeds: int, workers: int) -> None:
-    """Where methods fail: stress.csv and png, over one knob of a small toy at a time."""
-    plt, names, rows = plotting(), {}, {}
-    for knob, values in STRESS.items():
-        for value, (method, settings) in itertools.product(values, STRESS_METHODS.items()):
-            toy = CALM | {knob: value}
-            name = "-".join(map(str, (method, *toy.values())))  # knobs share their calm cell
-            names[knob, value, method] = name
-            rows[name] = settings | dict(amp=toy.pop("amp"), toy=toy | dict(size=64))
-    groups = matrix("stress", rows, given, seeds, workers)
-    table = [table_line(dict(knob=knob, value=value, method=method), groups[name])
-             for (knob, value, method), name in names.items()]
-    figure, axes = plt.subplots(2, len(STRESS), figsize=(16, 7), sharey="row")
-    for pair, (knob, values) in zip(axes.T, STRESS.items()):
-        for i, method in enumerate(STRESS_METHODS):
-            mine = [r for r in table if (r["knob"], r["method"]) == (knob, method)]
-            for axis, key in zip(pair, ("psnr", "sdf_error")):
-                mean, std = (np.array([r[k] for r in mine], float) for k in (key, key + "_std"))
-                axis.errorbar(range(len(values)), mean, std, color=COLORS[i], marker="os^Dv<>"[i],
-                              ms=4, capsize=2, label=method)
-                axis.set_xticks(range(len(values)), values)
-        failures = sum(r["failures"] for r in table if r["knob"] == knob)
-        pair[0].set_title(f"{failures} failed runs", fontsize=9)
-        pair[1].set_xlabel(KNOB_UNITS[knob])
-    axes[0, 0].set_ylabel("PSNR, dB")
-    axes[1, 0].set_ylabel("SDF error, radii")
-    figure.legend(*axes[0, 0].get_legend_handles_labels(), ncol=7, loc="lower center",
-                  bbox_to_anchor=(0.5, -0.03))
-    publish("stress", table, figure)
-
-
-# ---- 13 Command line -----------------------------------------------------------------------------
+# ---- 11 Command line -----------------------------------------------------------------------------
 
 def make_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0], allow_abbrev=False,
                                      argument_default=argparse.SUPPRESS)
 
-    def error(message):  # bad flags end with one sentence that names the nearest right one
-        for word in message.split():
-            near = difflib.get_close_matches(word.split("=")[0], parser._option_string_actions, 1)
-            if word.startswith("--") and near and "unrecognized" in message:
-                message += f"; did you mean {near[0]}?"
+    def error(message):  # bad flags end with one sentence
         raise UserError(f"{message} (python geonvs.py --help lists all flags)")
     parser.error = error
     for f in fields(Config):
-        more = dict(type=type(f.default), choices=f.metadata["choices"])
-        if f.type == "bool":
-            more = dict(action=argparse.BooleanOptionalAction)
-        parser.add_argument(f"--{f.name}", help=f"{f.metadata['help']} [{f.default}]", **more)
-    add = parser.add_argument
-    add("--resume", action="store_true", help="go on from the run's checkpoint")
-    add("--chart", nargs="*", metavar="RUN", help="speed against accuracy: of finished runs, or of "
-        "the three methods trained now")
-    add("--front", action="store_true", help="quality against speed of the method's own knobs")
-    add("--ablation", action="store_true", help="what each piece buys")
-    add("--stress", action="store_true", help="where methods fail: the toy's knobs, one by one")
-    add("--seeds", type=int, help="seeds of --chart, --front, --ablation and --stress [3]")
-    add("--render", choices=("orbit", "appearance"), help="write a short film of a finished run")
+        parser.add_argument(f"--{f.name}", type=type(f.default), choices=f.metadata["choices"],
+                            help=f"{f.metadata['help']} [{f.default}]")
+    parser.add_argument("--resume", action="store_true", help="go on from the run's checkpoint")
+    parser.add_argument("--render", action="store_true", help="film a finished run: a path through "
+                        "the cameras, then one view through the lights of the photos")
     return parser
 
 
 def pick_device(name: str) -> torch.device:
+    """The device of this process: with torchrun each has its own GPU."""
     count = torch.cuda.device_count() if torch.cuda.is_available() else 0
     names = ["cpu", *(f"cuda:{i}" for i in range(count))]
     chosen = ("cuda" if count else "cpu") if name == "auto" else name
-    if chosen == "cuda" or chosen in names[1:] and RANKS > 1:
-        chosen = f"cuda:{LOCAL_RANK}"  # each process has its own
+    chosen = f"cuda:{LOCAL_RANK}" if chosen == "cuda" else chosen
     need(chosen in names, f"--device {name} is not there: this machine has {', '.join(names)}")
     return torch.device(chosen)
 
 
-def scene_name(cfg: Config) -> str:
-    return Path(cfg.data).resolve().name if cfg.data else cfg.scene
-
-
-def scene_file(cfg: Config) -> Path:
-    return data_prep.scene_path(cfg.data or cfg.scene, bool(cfg.data))
-
-
-def find_scene(cfg: Config) -> dict:
-    """The scene of a configuration from its file, made on first use or when the split file or the
-    reconstruction of its folder is newer. Raises UserError."""
-    path, is_toy = scene_file(cfg), not cfg.data and cfg.scene == "toy"
-    scene = data_prep.read_scene(path) if path.exists() else None
-    info = json.loads(str(scene["info"])) if scene else {}
-    split = info.get("split")  # named by data_prep.py --split
-    folders = [cfg.data] if cfg.data else [] if is_toy else [
-        f"data/{name}" for name in (cfg.scene, data_prep.SCENES[cfg.scene][0])]
-    sources = [Path(split)] if split else [t for f in folders for t in Path(f).glob("[!.]*.tsv")]
-    sources += [model for f in folders for model in Path(f).glob("**/images.bin")]
-    is_old = scene and any(
-        s.exists() and s.stat().st_mtime > path.stat().st_mtime for s in sources)
-    if scene and not is_old and (is_toy or info["downscale"] == cfg.downscale):
-        return scene
-    print(f"making {path}")
-    if cfg.data:
-        scene = data_prep.prepare(cfg.data, cfg.downscale, split)
-    elif is_toy:
-        scene = data_prep.make_toy()
-    else:
-        scene = data_prep.locate_and_prepare(cfg.scene, "data", cfg.downscale, split)
-    data_prep.write_scene(path, scene)
-    return scene
-
-
 def check(cfg: Config) -> None:
     """Refuses settings that cannot work, before anything is written."""
-    for name, value in asdict(cfg).items():
-        if isinstance(value, (int, float)) and not 0 <= value < 2 ** 63:
-            raise UserError(f"--{name} {value} makes no sense: use a number >= 0")
-    least = dict(samples=2, bg_samples=2, rays=2 * RANKS, mask_px=16) | dict.fromkeys(
-        ("photos", "steps", "downscale", "channels", "hidden", "mask_every", "bg_levels"), 1)
-    least |= dict(rays=256) if cfg.method == "hanerf" else {}  # its encoder reads the grid of rays
-    for name, bound in least.items():
-        if getattr(cfg, name) < bound:
-            raise UserError(f"--{name} {getattr(cfg, name)} is too small: use at least {bound}")
-    if max(cfg.levels, cfg.bg_levels) > 9:
-        raise UserError("--levels and --bg_levels go up to 9: 4096 cells a side")
-    if cfg.method == "hanerf" and math.isqrt(cfg.rays) ** 2 != cfg.rays:
-        raise UserError(f"--rays {cfg.rays} is no square, as hanerf's grid of rays needs: try 1024")
-    if cfg.rays % cfg.photos:
-        raise UserError(f"--rays {cfg.rays} must be a multiple of --photos {cfg.photos}")
+    least = dict(samples=2, bg_samples=2, rays=2, photos=1, steps=1, downscale=1, hidden=1)
+    for f in fields(cfg):
+        value, low = getattr(cfg, f.name), least.get(f.name, 0)
+        is_right = (isinstance(value, str) if f.type == "str" else low <= value < 2 ** 63)
+        need(is_right and value in (f.metadata["choices"] or [value]),
+             f"--{f.name} {value} makes no sense: use a number from {low}, or see --help")
+    need(cfg.levels <= 9, "--levels goes up to 9: 4096 cells a side")
+    need(cfg.rays % (cfg.photos * RANKS) == 0,
+         f"--rays {cfg.rays} must be a multiple of --photos {cfg.photos} times the processes")
 
 
-def execute(cfg: Config, arrays, run: Path, saved: dict | None = None) -> dict:
+def make_config(given: dict) -> Config:
+    """Config's defaults, then the scene's settings, then flags."""
+    return Config(**({} if given.get("data") else SCENES[given.get("scene", "toy")]) | given)
+
+
+def execute(cfg: Config, arrays: dict, run: Path, saved: dict | None = None, kind=GeoNVS) -> dict:
     """Trains and scores one model on the dictionary of a scene file; returns its metrics."""
     device = pick_device(cfg.device)
-    scene = load_scene(arrays, device, cfg.mask_px)
+    scene = load_scene(arrays, device)
     run.mkdir(parents=True, exist_ok=True)
-    print(f"{cfg.method} on {scene.info['scene']}: {len(scene.wh)} photos "
+    print(f"{kind.name} on {scene.info['scene']}: {len(scene.wh)} photos "
           f"({len(scene.photos(True))} held out), {len(scene.rgb):,} pixels; {device}; {run}/")
-    model, state, meter = train(cfg, scene, run, saved)
-    energy = meter.report()  # of all processes
-    metrics = agreed(RANK or finish(model, scene, cfg, state, energy, run))
+    model, state = train(cfg, scene, run, saved, kind)
+    metrics = agreed(RANK or finish(model, scene, state, run))
     shown = ("psnr", "psnr_floor", "ssim", "lpips", "sdf_error", "mask_iou", "mask_static",
              "train_seconds", "energy_wh")
     print("".join(f"  {k} {metrics[k]:.4g}" for k in shown if metrics.get(k) is not None))
     return metrics
 
 
-def make_config(given: dict) -> Config:
-    """Config's defaults, the scene's settings, the method's, the preset's factors, then flags."""
-    chosen = {} if given.get("data") else dict(SCENES.get(given.get("scene", "toy"), {}))
-    method, preset = given.get("method", "geonvsw"), given.get("preset", "default")
-    _, published, tuned = METHODS[method]
-    chosen |= published | (tuned if given.get("tuned") else {})
-    for name, factor in PRESETS[preset].items() if method == "geonvsw" else ():
-        chosen[name] = round(chosen.get(name, getattr(Config, name)) * factor)
-    return Config(**chosen | given)
-
-
 def main(argv: list[str] | None = None) -> None:
-    given = vars(make_parser().parse_args(argv))
-    commands = {k: given.pop(k) for k in set(given) - {f.name for f in fields(Config)}}
-    cfg, seeds, saved = make_config(given), commands.get("seeds", 3), None
-    run = Path("runs") / (cfg.name or f"{scene_name(cfg)}-{cfg.method}-{cfg.seed}")
-    if {"resume", "render"} & set(commands):
-        if {"preset", "tuned"} & set(given):
-            raise UserError("--preset and --tuned are for new runs: a saved one keeps its settings")
-        saved = read_checkpoint(run / "checkpoint.pt")
-        cfg = Config(**saved["config"] | given)
+    given, saved = vars(make_parser().parse_args(argv)), None
+    resume, render = (given.pop(k, False) for k in ("resume", "render"))
+    cfg = make_config(given)
+    where = Path(cfg.data).resolve().name if cfg.data else cfg.scene
+    run = Path("runs") / (cfg.name or f"{where}-{GeoNVS.name}-{cfg.seed}")
+    if resume or render:
+        saved, cfg = read_checkpoint(run / "checkpoint.pt", given)
     check(cfg)
-    if seeds < 1 or RANKS > 1 and {"chart", "front", "ablation", "stress"} & set(commands):
-        raise UserError("experiments need --seeds of at least 1 and one process, not torchrun")
     device = pick_device(cfg.device)
-    workers = 1 if device.type == "cuda" else torch.get_num_threads()
-    timed = dict(minutes=0.0 if "steps" in given else 2.0, curve=True) | given  # all threads
     if device.type == "cuda":
         torch.cuda.set_device(device)
     if RANKS > 1:
         dist.init_process_group("cpu:gloo,cuda:nccl" if device.type == "cuda" else "gloo",
                                 timeout=datetime.timedelta(days=1))  # the first scores alone
         sys.stdout = open(os.devnull, "w") if RANK else sys.stdout
-    if commands.get("chart"):
-        runs = [read_metrics(Path(run)) for run in commands["chart"]]
-        names = [m["method"] + " tuned" * m["config"]["tuned"] for m in runs]
-        chart("chart", {name: [m for m, n in zip(runs, names) if n == name]
-                        for name in RIVALS if name in names})
-    elif "chart" in commands:
-        rows = {name: row for name, row in RIVALS.items() if row["tuned"] == cfg.tuned}
-        chart("chart", matrix(f"chart-{scene_name(cfg)}", rows, timed, seeds))
-    elif "front" in commands:
-        chart("front", matrix(f"front-{scene_name(cfg)}", FRONT, timed, seeds, workers))
-    elif "ablation" in commands:
-        ablation(given, seeds, workers)
-    elif "stress" in commands:
-        stress(given, seeds, workers)
-    elif "render" in commands:
-        scene = load_scene(find_scene(cfg), device, cfg.mask_px)
-        model = METHODS[cfg.method][0](cfg, scene)
-        restore(saved, run / "checkpoint.pt", model, None, None)
-        film(model, scene, commands["render"], run / f"{commands['render']}.mp4")
+    agreed(RANK or bool(data_prep.open_scene(cfg.data or cfg.scene, cfg.downscale)))
+    arrays = data_prep.open_scene(cfg.data or cfg.scene, cfg.downscale)
+    if render:
+        scene = load_scene(arrays, device)
+        model = GeoNVS(cfg, scene)
+        restore(saved, run / "checkpoint.pt", model)
+        film(model, scene, run / "film.mp4")
     else:
-        try:
-            arrays = RANK or find_scene(cfg)
-        finally:  # the others read what the first one made, or fail as it did
-            agreed(None)
-        execute(cfg, find_scene(cfg) if RANK else arrays, run, saved)
+        execute(cfg, arrays, run, saved)
 
 
 def run_command_line(entry) -> None:
