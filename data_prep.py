@@ -378,7 +378,7 @@ def statistics(scene):
     """Adds what geonvs.py decides by. track_photo (sorted) sees track_point at track_uv (T,2), over
     wh, if in 0..1. near (I,): 0.8 x the 2 % quantile of their distances, >= 0.02. Of the training
     photos: footprint, lower quartile of a pixel's size at points in the sphere; exposure_spread,
-    deviation of brightness (0..1) at equal points; bg_color (3,), beyond it, NaN unless 60 % agree."""
+    deviation of brightness (0..1) at equal points; bg_color (3,), beyond; NaN unless 60 % agree."""
     K, c2w, wh, start, rgb, points = (scene[k] for k in "K c2w wh start rgb points".split())
     ends = np.searchsorted(scene["track_photo"], np.arange(1, len(wh)))
     step, near, places, rows = max(1, len(rgb) // 500_000), [], [], []
