@@ -932,8 +932,7 @@ def test_thumbnails_are_whole_photos_upright_in_rgb_of_half_the_usual_size(side,
 
 def sphere_rays(o, d, near=0.1):
     o, d = torch.as_tensor(o).float(), F.normalize(torch.as_tensor(d).float(), dim=1)
-    n = len(o)
-    return g.Rays(o, d, torch.full((n,), near), torch.zeros(n).long(), torch.zeros(n, 2), torch.zeros(n, 3))
+    return g.Rays(o, d, near + 0 * o[:, 0], torch.zeros(len(o)).long(), 0 * o[:, :2], 0 * o)
 
 
 def test_sphere_interval_is_where_a_ray_is_inside_or_empty_at_its_closest_approach():
@@ -1071,9 +1070,9 @@ def test_points_outside_the_cube_get_the_nearest_features_inside(far):
 
 
 @pytest.mark.parametrize("levels, root", [(1, 1), (3, 1), (5, 2)])
-def test_one_cell_empty_levels_and_no_points_give_finite_features_and_gradients(levels, root):
+def test_one_cell_empty_levels_wild_and_no_points_give_finite_features_and_gradients(levels, root):
     octree = g.Octree(1.0, levels, 2, root=root)  # nothing is split
-    x = torch.tensor([[0.0, 0, 0], [1, 1, 1], [-1, 0.5, 1], [1e4, -1e4, 0], [1e30, 0, -1e30]])
+    x = torch.tensor([[0.0, 0, 0], [1, 1, 1], [-1, 0.5, 1], [1e30, -1e4, 0], [math.nan, math.inf, -math.inf]])
     out = octree(x, derivatives=True)
     out.square().sum().backward()
     assert out.shape == (5, levels, 4, 2) and len(octree.features) - g.PINNED == (root + 1) ** 3
@@ -1092,8 +1091,9 @@ def test_seeding_splits_dense_levels_then_the_neighbourhood_of_points():
     assert (octree.locate(points)[0] >= g.PINNED).all()  # no corner beside a point hangs
     assert octree.features[g.PINNED:].square().mean().sqrt().item() == pytest.approx(octree.std, rel=0.1)
     assert octree.cell_of(torch.tensor([[-9, 1.6, 9]]), 1).tolist() == [[0, 15, 15]]
-    g.seed_octree(uniform := g.Octree(1.0, 3, 1, root=4), points, 2)
-    assert [len(c) for c in uniform.cells] == [64, 512, 4096]
+    for levels, dense in ((3, 2), (2, 1), (1, 1)):  # fine everywhere
+        g.seed_octree(uniform := g.Octree(1.0, levels, 1, root=4), points, dense)
+        assert [len(c) for c in uniform.cells] == [64, 512, 4096][:levels]
 
 
 @pytest.mark.parametrize("footprint", [0.02, 0.011, 0.004])
@@ -1120,7 +1120,6 @@ def dense_tree():
 FRONT, SIDE = ([c + BALL_R * v / math.hypot(*d) for c, v in zip(CENTRE.tolist(), d)]
                for d in ((0.3, -0.5, 0.8), (-1.0, 0.2, 0.1)))  # on the ball
 FAR, RIM, BEYOND = (0.0, 0.65, -0.3), (0.70, 0.69, 0.01), (0.71, 0.72, 0.01)  # RIM and BEYOND: |x| = 0.98, 1.01
-CELL = 2 / 32  # of level 2
 
 
 def hits_of(*groups):
@@ -1149,7 +1148,7 @@ def is_split(octree, x, level=2):
     (FRONT, False, [(10, FRONT, 0.15, 0), (15, BEYOND, 1e-3, 0)]),  # the quartile is the lower one, and of all rays
     (FRONT, True, [(10, FRONT, 0.15, 0), (17, BEYOND, 1e-3, 0)]),
     (FRONT, True, [(g.SPLIT_RAYS, FRONT, 0.5, 0)]), (FRONT, False, [(g.SPLIT_RAYS - 1, FRONT, 0.5, 0)]),
-    (FRONT, True, [(10, FRONT, 0.5, 0.45 * CELL)]), (FRONT, False, [(10, FRONT, 0.5, 0.55 * CELL)]),  # child's side
+    (FRONT, True, [(10, FRONT, 0.5, 0.9 / 32)]), (FRONT, False, [(10, FRONT, 0.5, 1.1 / 32)]),  # a child's side
     (FAR, False, [(30, FAR, 0.9, 0)]), (RIM, True, [(10, RIM, 0.9, 0)]), (BEYOND, False, [(10, BEYOND, 0.9, 0)])])
 def test_cells_of_the_surface_split_where_enough_rays_miss_their_colour_by_more_than_is_usual(where, want, groups):
     def sdf(x):  # the ball, and what goes on beyond the sphere
@@ -1337,11 +1336,12 @@ def sigmoid(x):
     return 1 / (1 + math.exp(-x))
 
 
-def test_deviation_starts_at_its_width_and_is_an_exponential():
+def test_deviation_starts_at_its_width_and_is_an_exponential_within_bounds():
     deviation = g.Deviation(20.0)
     close(deviation(), 20, rtol=1e-4)
-    deviation.v.data += 0.1
-    close(deviation(), 20 * math.e, rtol=1e-4)
+    for v, want in ((0.4, math.e ** 4), (-50.0, 1e-2), (50.0, 1e5)):
+        deviation.v.data.fill_(v)
+        close(deviation(), want, rtol=1e-4)
 
 
 def ray_of_plane(cos, n, zeta):
@@ -1705,7 +1705,6 @@ def test_each_term_of_the_objective_and_all_that_is_remembered_equal_their_defin
     total, raw = model.losses(rays, pick, len(model.hits) // 64 + 1, generator())
     (x, s), eps, code, jitter = seen[-1], model.eps, model.codes()[rays.img], torch.rand(64, 12, generator=generator())
     out, ends, ball, sfm = g.render_rays(model, rays, code, jitter), x[:320].reshape(64, 5, 3), x[320:352], x[352:]
-    close(ends.mean(1), out["x"], atol=1e-5)
     close((ends - out["x"][:, None]).norm(dim=2), eps * torch.tensor([0.0, 1, 1, 1, 1]).expand(64, 5), atol=1e-5)
     assert ball.norm(dim=1).max() < 1 < ball.norm(dim=1).max() + 0.2 and ball.mean(0).norm() < 0.4
     assert (sfm[:, None] == model.sfm).all(2).any(1).all() and len(sfm.unique(dim=0)) > 20 and len(sfm) == 32
@@ -1719,7 +1718,6 @@ def test_each_term_of_the_objective_and_all_that_is_remembered_equal_their_defin
     for name, value in want.items():
         assert raw[name].mean().item() == pytest.approx(value.item(), rel=1e-4), name
     assert total.item() == pytest.approx(objective(want), rel=1e-4)
-
     told = torch.stack([error, out["depth"] / scene.K[rays.img, 0]], 1)  # for refinement, in a ring of 512 steps
     close(model.hits[64:128], torch.cat([out["x"], told], 1), atol=1e-5)
     assert (model.hits[:, 4] != 2).sum() == 64
@@ -1734,8 +1732,7 @@ def test_each_term_of_the_objective_and_all_that_is_remembered_equal_their_defin
 def test_losses_are_finite_with_any_setting_mask_sdf_and_sharpness_and_beside_the_sphere(scene, changes):
     model, (rays, pick) = new_model(scene, **changes), batch(scene)
     away = rays._replace(o=rays.o * 100)  # no ray meets the sphere
-    assert finite(model, rays, pick) and finite(model, away, pick)
-    assert model.losses(away, pick, 1, generator())[1]["eik"] == 0
+    assert finite(model, away, pick) and model.losses(away, pick, 1, generator())[1]["eik"] == 0
     model.zero_grad()
     model.losses(rays, pick, 1, generator())[1]["curv"].backward()  # flattens the surface and does not hide it
     assert all(p.grad is None or name.startswith("sdf.") for name, p in model.named_parameters())
@@ -1744,7 +1741,7 @@ def test_losses_are_finite_with_any_setting_mask_sdf_and_sharpness_and_beside_th
         _, raw = model.losses(rays, pick, 1, generator())
         assert finite(model, rays, pick, 1) and raw["mask"].mean() == (logit > 0) == (raw["rgb"].item() == 0)
     model.sdf.lin2.weight.data.zero_()
-    for value, zeta in itertools.product((-1e4, -1e-4, 0.0, 0.03, 1e4), (1e-2, 20.0, 1e5)):
+    for value, zeta in ((-1e4, 1e-2), (-1e4, 1e5), (-1e-4, 1e5), (0.0, 20.0), (0.03, 20.0), (1e4, 1e5)):
         model.sdf.lin2.bias.data.fill_(value)  # the same s everywhere
         model.deviation = g.Deviation(zeta)
         _, raw = model.losses(rays, pick, 1, generator())
@@ -1756,7 +1753,7 @@ def test_only_lessons_teach_the_mask_and_every_eighth_step_the_cache(warm, scene
     model, told = like(warm, **LAM), []
     model.mask.remember = lambda *args: told.append(args) or g.TransientMask.remember(model.mask, *args)
     model.cache.volume.fill_(7)
-    for step in range(17):
+    for step in (*range(9), *range(16, 64, 8)):
         (rays, pick), alone = batch(scene, seed=step), copy.deepcopy(model.mask)
         model.zero_grad()
         total, raw = model.losses(rays, pick, step, generator(step))
@@ -1791,7 +1788,7 @@ def test_a_bad_batch_does_not_poison_what_the_model_remembers(warm, scene, monke
 
 def test_every_parameter_has_one_group_and_the_rate_of_its_kind(scene):
     model = new_model(scene, lr_net=0.1, lr_grid=0.2, lr_zeta=0.3)
-    kinds = {o.features: 0.2 for o in g.octrees_of(model)} | {model.deviation.v: 0.3}
+    kinds = {model.deviation.v: 0.3} | {octree.features: 0.2 for octree in g.octrees_of(model)}
     kinds |= dict.fromkeys(model.mask.parameters(), 8e-3)
     rates = [(id(p), group["lr"]) for group in model.groups() for p in group["params"]]
     assert sorted(rates) == sorted((id(p), kinds.get(p, 0.1)) for p in model.parameters()) and len(kinds) > 20
@@ -1801,9 +1798,8 @@ def test_warm_up_on_uniform_points_makes_a_sphere_and_the_cache_knows_it(warm):
     x, n = g.random_ball(20_000, generator(5)), warm.cache.volume.shape[-1]
     close(np.histogram(x.norm(dim=1) ** 3, np.linspace(0, 1, 11))[0] / 20_000, np.full(10, 0.1), atol=0.012)
     assert (warm.distance(x) - (x.norm(dim=1) - 0.5)).square().mean().sqrt() < 0.02 and x.mean(0).norm() < 0.02
-    for at in ((0, 0, 0), (5, 17, 40), (n - 1, 3, n - 2)):
-        s = warm.distance(torch.tensor([at]) * 2 / (n - 1) - 1)
-        assert warm.cache.volume[0, 0][at].item() == pytest.approx(s.item(), abs=1e-5)
+    at = torch.tensor([(0, 0, 0), (5, 17, 40), (n - 1, 3, n - 2)])
+    close(warm.cache.volume[0, 0][tuple(at.T)], warm.distance(at * 2 / (n - 1) - 1), atol=1e-5)
 
 
 def test_automatic_parts_follow_the_facts_of_the_scene_and_settings_overrule_them(scene):
@@ -1823,20 +1819,19 @@ def test_automatic_parts_follow_the_facts_of_the_scene_and_settings_overrule_the
 
 @pytest.mark.parametrize("grid", ["octree", "uniform"])
 def test_the_poorest_scenes_train(scene, grid):
-    """No points; photos of one colour; one level; one photo and two rays, as few as --rays allows."""
     none = dict.fromkeys(("track_photo", "track_point"), torch.zeros(0, dtype=torch.long))
     for poor, changes in ((scene._replace(points=scene.points[:0], track_uv=scene.track_uv[:0], **none), {}),
                           (scene._replace(rgb=0 * scene.rgb, thumbs=0 * scene.thumbs), {}), (scene, dict(levels=1))):
         model = new_model(poor, grid=grid, **changes)
-        assert finite(model, *batch(poor)) and finite(model, *batch(poor, 2, 1))
+        assert finite(model, *batch(poor)) and finite(model, *batch(poor, 2, 1))  # as few rays as --rays allows
 
 
 @pytest.mark.parametrize("setting, masked, is_last, stays", [
     ("auto", [], True, False), ("auto", [], False, True), ("on", [], True, True), ("printed", [], True, True),
-    ("auto", [True], True, False), ("auto", [False], True, True)])  # held-out or training photos
+    ("auto", [True], True, False), ("auto", [False], True, True)])  # held-out photos, or 2 % of training photos
 def test_a_mask_that_is_nearly_empty_goes_off_at_the_last_plan(scene, setting, masked, is_last, stays):
     model = new_model(scene, mask=setting)
-    model.mask.logits[[is_test in masked for is_test in scene.is_test.tolist()], :, :1] = 9.0  # 2 % of the pixels
+    model.mask.logits[[is_test in masked for is_test in scene.is_test.tolist()], :, :99 if True in masked else 1] = 9.0
     assert model.plan(is_last)["has_mask"] is stays and model.mask.is_on
 
 
@@ -1876,7 +1871,6 @@ def test_following_a_plan_moves_adams_moments_along_with_their_features(scene):
 # ---- 8 energy ------------------------------------------------------------------------------------------
 
 def metered(spans, joules=0.0, period=0.0, **reading):
-    """Joules of a meter that is read now and after each of the spans, in which so many joules are spent."""
     t, j = [0.0], [1000.0]
     reading = {name: lambda f=f: f(t[0], j[0]) for name, f in reading.items()}
     meter = g.EnergyMeter("fake", clock=lambda: t[0], **reading)
@@ -1911,8 +1905,7 @@ def test_rapl_sums_packages_each_with_its_own_wrap_and_skips_their_parts(tmp_pat
             (folder / "max_energy_range_uj").write_text(f"{wrap}\n")
         meter = meter or g.rapl_meter(str(tmp_path))
         meter.tick()
-    assert meter.joules == pytest.approx(0.3 + 0.05 + 0.1 + 0.3) and "rapl" in meter.source
-    assert g.rapl_meter(str(tmp_path / "nothing")).joules is None
+    assert meter.joules == pytest.approx(0.75) and g.rapl_meter(str(tmp_path / "nothing")).joules is None
 
 
 @pytest.mark.parametrize("counter, power, joules", [(True, 9, 0.002), (False, 30_000, 30 * 4.0), (False, None, None)])
@@ -1937,9 +1930,8 @@ def hasten(patch):
     plan = g.GeoNVS.plan
 
     def splitting(self, is_last):
-        found, octree = plan(self, is_last), self.sdf.octree
-        keys = octree.key(octree.cells[1], 1)
-        found["keys"][1] = torch.cat([found["keys"][1], keys[len(octree.row_key) % 97::97]])
+        found, cells = plan(self, is_last), self.sdf.octree.key(self.sdf.octree.cells[1], 1)
+        found["keys"][1] = torch.cat([found["keys"][1], cells[len(self.sdf.octree.row_key) % 97::97]])
         return found
     patch.setattr(g.GeoNVS, "start", lambda self, gen: None)
     patch.setattr(g.GeoNVS, "plan", splitting)
@@ -1949,7 +1941,6 @@ quick = pytest.fixture(lambda monkeypatch: hasten(monkeypatch), name="quick")
 
 
 def before_step(patch, act):
-    """act(state) before each training step."""
     step = g.training_step
     patch.setattr(g, "training_step", lambda *args: (act(args[3]), step(*args))[1])
 
@@ -2067,10 +2058,10 @@ def test_twenty_void_steps_in_a_row_stop_a_run_with_its_last_good_weights_and_fe
         scene, tmp_path, quick, monkeypatch):
     for rates in (dict(lr_net=1e30, lr_grid=1e30), dict(lr_zeta=1e6)):  # end in no worse than a sentence
         with contextlib.suppress(g.Diverged):
-            run_training(scene, tmp_path, steps=40, **rates)
+            run_training(scene, tmp_path, steps=25, **rates)
     with monkeypatch.context() as patch:
         spoil(patch, lambda step: step % 20 > 0)
-        assert run_training(scene, tmp_path, steps=41)[1]["dropped"] == 41 - 3
+        assert run_training(scene, tmp_path, steps=21)[1]["dropped"] == 21 - 2
     spoil(monkeypatch, lambda step: step >= 2)
     with pytest.raises(g.Diverged, match=f"learning rate.*{tmp_path}/checkpoint.pt"):
         run_training(scene, tmp_path, steps=1000)
@@ -2145,25 +2136,23 @@ def test_bad_checkpoints_are_refused_in_one_sentence_and_do_no_harm(six, scene, 
             bad[bit // 8] ^= 1 << bit % 8
         refused(bytes(bad))  # or a flipped bit of a weight passes
     assert all(refused(data[:n]) and refused(rng.bytes(n % 300)) for n in (0, 1, *rng.integers(0, len(data) - 23, 6)))
-    odd = [None, -1, math.nan, "x", [], {"a": 1}, torch.zeros(0), torch.full((5,), 2 ** 62), Path]
+    odd = [None, -1, "x", [], {"a": 1}, torch.full((5,), 2 ** 62), Path]
     bad = [good | {key: value} for key in ("config", "model", "octrees", "optimizer", "state") for value in odd]
     bad += [good | dict(config=good["config"] | {key: "x"}) for key in ("rays", "lam_gpl", "flux")]
-    assert all(map(refused, [*odd, *bad, good | dict(run=Path), b"cos\nmkdir\n(S'%s'\ntR." % bytes(tmp_path / "harm")]))
-    assert not (tmp_path / "harm").exists() and not refused(data)
+    bad += [*odd, good | dict(run=Path), b"cos\nmkdir\n(S'%s'\ntR." % bytes(tmp_path / "harm")]
+    assert all(map(refused, bad)) and not (tmp_path / "harm").exists() and not refused(data)
 
 
 @pytest.mark.parametrize("changes", [dict(hidden=8), dict(levels=4), dict(background="off"), {}])
 def test_a_checkpoint_that_does_not_fit_is_refused_and_its_run_stays(scene, tmp_path, quick, six, changes):
-    for name in ("log.jsonl", "checkpoint.pt"):
-        shutil.copy(six.run / name, tmp_path)
-    before, saved = {p.name: p.read_bytes() for p in tmp_path.iterdir()}, checkpoint(tmp_path)
+    run = shutil.copytree(six.run, tmp_path / "run")
+    before, saved = {p.name: p.read_bytes() for p in run.iterdir()}, checkpoint(run)
     with pytest.raises(UserError, match="does not fit"):
-        run_training(scene, tmp_path, saved if changes else saved | dict(rng=None), **changes)
-    assert {p.name: p.read_bytes() for p in tmp_path.iterdir()} == before
+        run_training(scene, run, saved if changes else saved | dict(rng=None), **changes)
+    assert {p.name: p.read_bytes() for p in run.iterdir()} == before
 
 
 def together():
-    """What each of the processes does: a run of the command line, then one that the first interrupts."""
     def kept(*args):
         model, state = train(*args)
         torch.save(dict(model.named_parameters()) | dict(hits=model.hits, state=state), f"{g.RANK} of {g.RANKS}.pt")
@@ -2248,8 +2237,7 @@ def test_fitting_codes_starts_from_the_mean_sees_left_halves_only_and_touches_no
         for photo in photos.tolist():
             rgb[scene.start[photo] + g.half_pixels(scene, photo, left)] *= shade
         fitted.append(g.fit_codes(model, scene._replace(rgb=rgb), photos, 8, 16))
-    start = model.codes()[~scene.is_test].mean(0).expand(2, -1)
-    close(g.fit_codes(model, scene, photos, 0), start)
+    close(start := g.fit_codes(model, scene, photos, 0), model.codes()[~scene.is_test].mean(0).expand(2, -1))
     assert torch.equal(fitted[0], fitted[1]) and same_weights(model, warm)
     assert all(p.requires_grad and p.grad is None for p in model.parameters())
     rays = g.make_rays(scene, photos.repeat_interleave(60), torch.arange(120) % 60 * 11)
@@ -2299,8 +2287,7 @@ def test_a_rendered_photo_and_its_panel_show_pixels_in_order_whatever_the_chunk(
     monkeypatch.setattr(g, "CHUNK", 100)
     close(g.render_photo(warm, scene, 1, warm.codes()[1])["rgb"], whole["rgb"], atol=1e-4)
     whole |= dict(truth=whole["truth"] * 0 + [1, 0, 0], rgb=whole["rgb"] * 0 + [0, 0, 1])
-    tall = {k: v.transpose(1, 0, *range(2, v.ndim)) for k, v in whole.items()}
-    made = g.panel(warm, [(1, "a", whole), (0, "b", tall)])
+    made = g.panel(warm, [(1, "a", whole), (0, "b", {k: v[:, ::2] for k, v in whole.items()})])
     red, blue = (np.argwhere((made == color).all(2)) for color in ([255, 0, 0], [0, 0, 255]))
     assert len(red) == len(blue) > 1000 and red[:, 1].mean() < blue[:, 1].mean()
 
@@ -2330,17 +2317,16 @@ def test_mesh_of_the_warm_up_sphere_is_that_sphere_closed_looking_outwards_and_r
 
 @pytest.mark.parametrize("count", [8, 1])
 def test_a_film_goes_from_camera_to_camera_and_then_through_the_lights(warm, scene, tmp_path, monkeypatch, count):
-    shots, photos = [], scene.photos(False)[:count]
-    few = scene._replace(is_test=~torch.isin(torch.arange(10), photos))
+    few = scene._replace(is_test=~torch.isin(torch.arange(10), photos := scene.photos(False)[:count]))
     monkeypatch.setattr(g, "render_photo", lambda model, moved, view, code: shots.append(
         (moved.c2w[view], code)) or dict(rgb=np.zeros((*moved.wh[view].tolist()[::-1], 3))))
-    g.film(warm, few, tmp_path / "a.mp4")
-    video = g.cv2.VideoCapture(str(tmp_path / "a.mp4"))
+    shots, path = [], tmp_path / "a.mp4"
+    g.film(warm, few, path)
+    video = g.cv2.VideoCapture(str(path))
     (poses, codes), half = (torch.stack(part) for part in zip(*shots)), len(shots) // 2
     assert video.get(g.cv2.CAP_PROP_FRAME_COUNT) == len(shots) > 40 and video.read()[1].shape[0] % 2 == 0
     close(poses[:, :, :3] @ poses[:, :, :3].mT, torch.eye(3).expand(len(shots), 3, 3), atol=1e-4)  # rotations
-    for end in (poses[0], poses[half - 1]):
-        assert (scene.c2w[photos] - end).abs().amax((1, 2)).min() < 1e-2
+    assert all((scene.c2w[photos] - end).abs().amax((1, 2)).min() < 1e-2 for end in poses[[0, half - 1]])
     assert (poses[half:] == poses[half]).all() and (codes[:half] == codes[0]).all()
     close(codes[[half, -1]], warm.codes()[photos[[0, -1]]], atol=1e-3)
 
@@ -2379,12 +2365,13 @@ def test_one_command_trains_scores_and_writes_everything_and_others_go_on_and_fi
         energy_wh energy_source rays_per_second parameters octree_cells model_bytes peak_memory_bytes protocol torch
         commit config sdf_error mask_iou mask_static""".split()) and "left half" in metrics["protocol"]
     assert metrics["config"] == asdict(config(levels=3, seed=3)) and metrics["commit"] is None and metrics["psnr"] > 5
+    assert metrics["rays_per_second"] == pytest.approx(6 * 64 / metrics["train_seconds"])
     assert command("--resume", "--seed=3", "--steps=8") is None  # with the run's own settings
-    metrics = json.loads((run / "metrics.json").read_text())
-    assert (metrics["steps"], metrics["config"]["hidden"], log_of(run)[-1]["step"]) == (8, 16, 8)
-    assert metrics["rays_per_second"] == pytest.approx(8 * 64 / metrics["train_seconds"])
+    assert json.loads((run / "metrics.json").read_text())["config"] == asdict(config(levels=3, seed=3, steps=8))
     assert "--photos" in command("--resume", "--seed=3", "--rays=66")  # settings of a resumed run are checked too
-    assert command("--render", "--seed=3") is None and (run / "film.mp4").stat().st_size > 1000
+    monkeypatch.setattr(g, "film", lambda model, scene, path: torch.save(model.sdf.lin1.weight, path))
+    assert command("--render", "--seed=3") is None and log_of(run)[-1]["step"] == 8
+    assert torch.equal(torch.load(run / "film.mp4"), checkpoint(run)["model"]["sdf.lin1.weight"])
 
 
 @pytest.mark.parametrize("flags, word", [
@@ -2399,6 +2386,7 @@ def test_a_mistake_ends_with_code_2_and_one_line_that_helps_and_no_folder(comman
 
 
 def test_problems_end_with_code_2_and_one_line_and_a_full_disk_leaves_whole_files(command, monkeypatch):
+    monkeypatch.setattr(g, "finish", lambda *_: {})
     assert command(*FLAGS, "--name=a") is None
     before, limit = Path("runs/a/checkpoint.pt").read_bytes(), resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, limit[1]))  # a larger file cannot be written
@@ -2448,7 +2436,7 @@ def test_code_is_at_most_100_wide_and_python_3_10_can_read_it():
 
 def test_readme_names_flags_and_files_that_exist():
     text, sources = (HERE / "README.md").read_text(), "".join(p.read_text() for p in HERE.glob("*.py"))
-    known = {"help", "nproc_per_node", *inspect.signature(data_prep.make_toy).parameters, *(f.name for f in fields(g.Config))}
+    known = {"help", "nproc_per_node", *inspect.signature(data_prep.make_toy).parameters, *asdict(g.Config())}
     assert not {*re.findall(r"(?<![\w-])--([a-z]\w*)", text)} - known - {*re.findall(r"\"--(\w+)\"", sources)}
     paths = re.findall(r"\]\((?!https?:|#)([^)#]+)", text) + re.findall(r"`([\w.]+\.(?:py|ipynb|txt))`", text)
     assert paths and not [path for path in paths if not (HERE / path).exists()]
