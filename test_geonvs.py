@@ -22,6 +22,9 @@ from data_prep import UserError
 import data_prep
 import geonvs as g
 
+if __name__ != "__main__":
+    torch.set_num_threads(1)  # the scenes of tests are tiny: a second thread would only wait for the first
+
 # ==== Part I: tests ===================================================================================
 
 # ---- data_prep.py: the toy -------------------------------------------------------------------------
