@@ -1,8 +1,8 @@
 """Geo-NVS-w: a signed distance field, fed by tourist photos, becomes a picture from a new view.
 
 A minimal single-file reference implementation of "Geo-NVS-w: Geometry-Aware Novel View Synthesis
-In-the-Wild with an SDF Renderer" (Tsalakopoulos et al., ICCV 2025 workshops). Read it from the top:
-sections 2-7 follow one ray from the pixel to the loss, then comes the training loop around it.
+In-the-Wild with an SDF Renderer" (Tsalakopoulos et al., ICCV 2025 workshops). Sections 2-7 follow
+one ray from the pixel to the loss; then comes the training loop around it.
 
     python geonvs.py                       toy scene: made, trained, scored (minutes, 2 CPU cores)
     python geonvs.py --scene brandenburg   a Phototourism scene (one GPU); also sacre, trevi, taj
@@ -10,9 +10,7 @@ sections 2-7 follow one ray from the pixel to the loss, then comes the training 
     torchrun --nproc_per_node 4 geonvs.py  on 4 GPUs that share the rays of each step
     python geonvs.py --help                every setting with its meaning, unit and source
 
-A run writes runs/<name>/: metrics.json, log.jsonl, checkpoint.pt, panel.png and mesh.ply.
-
-Conventions, stated once
+Conventions
   world     the foreground is the unit sphere; x_file = x * scale + center leads back to SfM units
   cameras   c2w (3,4) camera to world, OpenCV axes: x right, y down, z forward; pixel centres +0.5
   rays      r(t) = o + t d with |d| = 1, so t is a distance along the ray and not a z-depth
@@ -68,7 +66,7 @@ def opt(default, text, *choices):
 
 @dataclass
 class Config:
-    """All settings. [R] marks a value that the paper leaves open (recommended by predecessors)."""
+    """All settings. [R]: a value that the paper leaves open, as predecessors recommend it."""
 
     scene: str = opt("toy", "synthetic, or of Phototourism", "toy", *data_prep.SCENES)
     data: str = opt("", "an IMC-PT or COLMAP folder instead of a named scene")
@@ -88,8 +86,7 @@ class Config:
     hidden: int = opt(64, "width of the MLPs")
     appearance_dim: int = opt(16, "length of a photo's appearance code")
     appearance: str = opt("auto", "codes; auto: on if exposures differ", "auto", "on", "off")
-    mask: str = opt("auto", "auto: off if nothing is transient; printed: as in the paper, without "
-                    "[D7] and [D14]", "auto", "on", "off", "printed")
+    mask: str = opt("auto", "printed: without [D7], [D14]", "auto", "on", "off", "printed")
     background: str = opt("auto", "field; auto: off if it is one colour", "auto", "on", "off")
     normals: str = opt("analytic", "derivatives of the SDF [D13]", "analytic", "fd")
     sampling: str = opt("cached", "how samples are placed [D11]", "cached", "uniform")
@@ -195,13 +192,12 @@ def random_rays(scene: Scene, photos: Tensor, n: int, per_step: int, gen: torch.
 
 def sphere_interval(rays: Rays) -> tuple[Tensor, Tensor, Tensor]:
     """t where each ray enters and leaves the unit sphere, and whether it does: (R,), (R,), (R,). A
-    ray that misses the sphere, or has it behind, gets the empty interval at its closest approach
-    (or at near), from where its background starts: no ray is dropped, no square root negative."""
+    ray that misses it, or has it behind, gets the empty interval where its background starts: at
+    its closest approach, or at near."""
     closest = -(rays.o * rays.d).sum(1)  # (R,)
     disc = closest ** 2 - (rays.o ** 2).sum(1) + 1  # (R,)
     half = disc.clamp(min=0).sqrt()  # (R,)
     hit = (disc > 0) & (closest + half > rays.near)  # (R,)
-    half = half * hit  # (R,)
     t0 = torch.maximum(closest - half, rays.near)  # (R,)
     return t0, torch.maximum(closest + half, t0), hit
 
@@ -216,17 +212,12 @@ TRILINEAR = torch.cat([torch.kron(x, torch.kron(y, z)) for x, y, z in (
     3 * [VALUE], (SLOPE, VALUE, VALUE), (VALUE, SLOPE, VALUE), (VALUE, VALUE, SLOPE))], 1)
 PINNED = 64  # rows that stay zero, for hanging corners: on one row a GPU would queue their writes
 CHUNK = 4096  # points or rays evaluated at once outside training; more rays on a GPU
-
-
-@functools.cache
-def resident(constant: Tensor, device: torch.device) -> Tensor:
-    """A constant on a device, copied once: a copy in every step would make a GPU wait."""
-    return constant.to(device)
+resident = functools.cache(Tensor.to)  # a constant on a device: one copy, as copies make a GPU wait
 
 
 class Interpolate(torch.autograd.Function):
     """out[p,j] = sum over the 8 corners k of w[p,j,k] features[corner[p,k]], for J sets of weights:
-    of the value, and of its derivatives along x, y, z. Fused: the hottest operation of a step."""
+    of the value, and of its derivatives along x, y, z. The hottest operation of a step."""
     @staticmethod
     def forward(ctx, features, corner, w):  # (V,C), (P,8), (P,J,8) -> (P,J,C)
         ctx.save_for_backward(corner, w)
@@ -253,10 +244,9 @@ class Octree(nn.Module):
     meet there. A corner with a missing cell around it ("hanging") is pinned to zero: the field is
     continuous across the borders of refined regions. A query concatenates the trilinear features of
     all levels on its path; absent levels contribute zeros."""
-    def __init__(self, half: float, levels: int, channels: int = 4, device="cpu", root: int = 16,
-                 std: float = 1e-2):
+    def __init__(self, half: float, levels: int, channels: int = 4, device="cpu", root: int = 16):
         super().__init__()
-        self.half, self.levels, self.root, self.std = half, levels, root, std
+        self.half, self.levels, self.root = half, levels, root
         self.features = nn.Parameter(torch.zeros(PINNED, channels, device=device))  # (V,C)
         self.register_buffer("row_key", torch.arange(PINNED, device=device))  # (V,) level, corner
         self.register_buffer("scale", root * 2.0 ** torch.arange(levels, device=device))  # (L,)
@@ -265,7 +255,6 @@ class Octree(nn.Module):
             value = torch.tensor(value, dtype=torch.int32, device=device).reshape(levels, -1)
             self.register_buffer(name, value, persistent=False)
         self.build([self.row_key[:0]] * (levels - 1))
-        self.features.data[PINNED:].normal_(0, std)
 
     def cell(self, level: int) -> float:
         """Side of a cell, scene units."""
@@ -328,11 +317,13 @@ class Octree(nn.Module):
         u = (x / (2 * self.half) + 0.5).nan_to_num(0).clamp(0, 1 - 1e-6)  # (P,3)
         at = u[:, None] * self.scale[:self.active, None]  # (P,L,3) in cells
         ijk = at.int()  # (P,L,3)
-        step = ((ijk & self.bits[:self.active]) * self.stride[:self.active]).sum(2)  # (P,L)
+        step = (ijk & self.bits[:self.active]) * self.stride[:self.active]  # (P,L,3)
+        step = step.sum(2, dtype=torch.int32)  # (P,L)
         nodes = [8 + step[:, 0]]  # (P,) root cell, then the child of the cell before
         for level in range(1, self.active):
-            nodes.append(self.child[nodes[-1]] + step[:, level])  # (P,)
-        return self.corner[torch.stack(nodes, 1)], at - ijk
+            nodes.append(self.child.index_select(0, nodes[-1]) + step[:, level])  # (P,)
+        corner = self.corner.index_select(0, torch.stack(nodes, 1).flatten())  # (PL,8)
+        return corner.reshape(len(x), -1, 8), at.frac()
 
     def forward(self, x: Tensor, derivatives: bool = False) -> Tensor:
         """Features (P,L,J,C) at x (P,3); J = 1, or 4: value, its change per cell along x, y, z."""
@@ -352,20 +343,20 @@ class Octree(nn.Module):
 
 
 def seed_octree(octree: Octree, points: Tensor, dense: int) -> None:
-    """Splits all cells of the first `dense` levels, then of the next those near points (P,3) and
-    their neighbours, so that the corners around a point are never hanging. [D10]"""
+    """Random features; all cells of the first `dense` levels split, of the next those near points
+    (P,3) and their neighbours, so that no corner around a point is hanging. [D10]"""
     for level in range(min(dense, octree.levels - 1)):
         octree.split(level, octree.cells[level])
     if dense < octree.levels - 1:
         step = torch.cartesian_prod(*[torch.arange(-1, 2, device=points.device)] * 3)  # (27,3)
         ijk = (octree.cell_of(points, dense)[:, None] + step).reshape(-1, 3)  # (27P,3)
         octree.split(dense, ijk.clamp(0, (octree.root << dense) - 1))
-    octree.features.data[PINNED:].normal_(0, octree.std)
+    octree.features.data[PINNED:].normal_(0, 0.01)
 
 
-def levels_for_footprint(footprint: float, root: int = 16, finest: int = 8) -> int:
+def levels_for_footprint(footprint: float) -> int:
     """Octree levels such that the finest cell is no smaller than a pixel at the surface."""
-    return int(np.clip(1 + math.floor(math.log2(2 / footprint / root)), 2, finest))
+    return int(np.clip(1 + math.floor(math.log2(2 / footprint / 16)), 2, 8))
 
 
 SPLIT_RAYS = 6  # recent rays that end in a cell before it is split
@@ -376,11 +367,10 @@ HIDDEN = 6.0  # zeta |s| from where on the field is not seen: sigmoid(-6) = 0.00
 @torch.no_grad()
 def refined_keys(octree: Octree, sdf, hits: Tensor, zeta: float, max_mb: float) -> list[Tensor]:
     """Split keys that fit the octree to the scene. sdf: (P,3) to (P,); hits (P,5): where recent
-    rays ended, their error, a pixel's size there; 2 where none was. Coarse levels come first, in
-    them the worst cells, as far as max_mb allows. A cell is split if it lies at the surface, enough
-    rays end in it, they miss their colour, and the children are not finer than its pixels. It is
-    merged again if nothing of it, nor within a child's side, where corners become pinned, is nearer
-    to the surface than HIDDEN / zeta: no pixel then changes by more than 2 sigmoid(-HIDDEN)."""
+    rays ended, their error, a pixel's size there; 2 where none was. A cell at the surface is split
+    if enough rays end in it, they miss their colour, and the children are not finer than pixels;
+    worst first, as far as max_mb allows. It is merged if nothing of it, nor within a child's side,
+    is nearer to the surface than HIDDEN / zeta: pixels change by at most 2 sigmoid(-HIDDEN)."""
     keys, hits = list(octree.split_keys), hits[hits[:, 4] != 2]  # (P,5)
     bound = SPLIT_ERROR * hits[:, 3].sort()[0][len(hits) // 4:][:1]  # (1,), or (0,) without hits
     hits = hits[hits[:, :3].norm(dim=1) < 1]  # (P,5) rays that miss the sphere split no cells
@@ -421,9 +411,9 @@ class SDFField(nn.Module):
         self.lin2 = nn.Linear(hidden, 1 + GEO)
 
     def forward(self, x: Tensor, with_gradient: bool = False) -> tuple[Tensor, Tensor, Tensor]:
-        """sdf (P,), geometry (P,G) and, if wanted, grad s (P,3) at x (P,3), in closed form. [D13]
-        The chain rule written out: ds/dx = ds/dz dz/dx with z = [x, features(x)]. It is an ordinary
-        differentiable expression, so training through normals needs no second-order autograd."""
+        """sdf (P,), geometry (P,G) and, if wanted, grad s (P,3) at x (P,3) [D13]: the chain rule
+        written out, ds/dx = ds/dz dz/dx with z = [x, features(x)], needs no second-order autograd.
+        """
         feat = self.octree(x, with_gradient)  # (P,L,1 or 4,C)
         value, slope = feat.split([1, feat.shape[2] - 1], 2)  # (P,L,1,C), (P,L,0 or 3,C)
         h = self.lin1(torch.cat([x, value.flatten(1)], 1))  # (P,H)
@@ -448,15 +438,13 @@ def taps(x: Tensor, eps: float) -> Tensor:
 
 
 def finite_differences(s: Tensor, eps: float) -> tuple[Tensor, Tensor]:
-    """Gradient (P,3) and Laplacian (P,) from s (P,5) at the taps (Neuralangelo): the mean
-    difference to the centre is eps^2/6 times the Laplacian, the k-weighted mean the gradient."""
+    """Gradient (P,3) and Laplacian (P,) from s (P,5) at the taps (Neuralangelo)."""
     k, mean = (resident(c, s.device).to(s.dtype) for c in (TAPS, MEAN))  # (5,3), (5,)
     return 0.75 / eps * (s @ k), 6 / eps ** 2 * (s @ mean)  # as sum k k^T is 4/3 of the identity
 
 
 def direction_basis(d: Tensor) -> Tensor:
-    """Polynomials up to degree 2 of unit directions (R,3): (R,9). They span what spherical
-    harmonics do, as x^2 + y^2 + z^2 is their constant."""
+    """Polynomials up to degree 2 of unit directions (R,3), which span spherical harmonics: (R,9)"""
     return torch.cat([d, d * d, d * d.roll(1, 1)], 1)
 
 
@@ -518,7 +506,7 @@ class Background(nn.Module):
             inputs = torch.cat([geo, per_ray.repeat_interleave(S, 0)], 1)  # (RS,GEO+9+A)
             rgb = self.color(inputs).float().sigmoid().reshape(R, S, 3)  # (R,S,3)
         sigma = F.softplus(density.reshape(R, S) - 1)[:, :-1]  # (R,S-1)
-        alpha = F.pad(-torch.expm1(-sigma * torch.diff(t)), (0, 1), value=1.0)  # (R,S)
+        alpha = F.pad(-torch.expm1(sigma * -torch.diff(t)), (0, 1), value=1.0)  # (R,S)
         w, _ = composite(alpha)  # (R,S)
         return (w[:, :, None] * rgb).sum(1)  # (R,3)
 
@@ -540,7 +528,7 @@ def neus_alpha(sdf: Tensor, cos: Tensor, dt: Tensor, zeta: Tensor) -> Tensor:
     Eq. 1 mended: 1 - sigmoid(zeta s_next) / sigmoid(zeta s_prev) (NeuS Eq. 13) with the two ends
     s -+ cos dt / 2 inside zeta [D2], divided so that opacities multiply up to 1 behind walls [D1].
     A section that leads outwards (cos > 0) is transparent. Logs of sigmoids do not overflow."""
-    half = F.relu(-cos) * dt / 2  # (R,S)
+    half = F.relu(cos * (dt / -2))  # (R,S)
     return -torch.expm1(F.logsigmoid(zeta * (sdf - half)) - F.logsigmoid(zeta * (sdf + half)))
 
 
@@ -627,7 +615,7 @@ def render_rays(model: "GeoNVS", rays: Rays, code: Tensor, jitter: Tensor) -> di
     cos = (grad.reshape(R, S, 3) * rays.d[:, None]).sum(2)  # (R,S)
     opacity_of = neus_alpha if cfg.alpha == "neus" else printed_alpha
     alpha = opacity_of(sdf.reshape(R, S), cos, torch.diff(edges), zeta)  # (R,S)
-    w, trans = composite(alpha * hit[:, None])  # (R,S), (R,)
+    w, trans = composite(alpha)  # (R,S), (R,); 0 and 1 where a ray misses: no section has a length
     per_ray = torch.cat([direction_basis(rays.d), code], 1)  # (R,9+A)
     inputs = torch.cat([geo, normal, per_ray.repeat_interleave(S, 0)], 1)  # (RS,G+3+9+A)
     rgb = (w[:, :, None] * model.color(inputs).sigmoid().reshape(R, S, 3)).sum(1)  # (R,3)
@@ -725,8 +713,8 @@ class TransientMask(nn.Module):
     and the objective that it learns from. m: side of the logits, px."""
     def __init__(self, cfg: Config, scene: Scene):
         super().__init__()
-        self.cfg, self.thumbs, self.is_on = cfg, scene.thumbs, cfg.mask != "off"
-        self.cgnet, I, m = CGNet(), len(scene.thumbs), (scene.thumbs.shape[3] + 1) // 2
+        self.cfg, self.thumbs, self.cgnet = cfg, scene.thumbs, CGNet()
+        I, m = len(scene.thumbs), (scene.thumbs.shape[3] + 1) // 2
         static = torch.zeros(I, 1, m, m, dtype=torch.bool, device=scene.thumbs.device)
         ok = ((scene.track_uv >= 0) & (scene.track_uv < 1)).all(1)  # not those that SfM got wrong
         col, row = (scene.track_uv[ok] * m).long().unbind(1)  # (T,)
@@ -738,6 +726,10 @@ class TransientMask(nn.Module):
                 static=static,  # pixels that show an SfM point, but for outlines scene [D10]
                 usual=torch.tensor(0.3)).items():  # running upper quartile of such pixels' errors
             self.register_buffer(name, value)
+
+    @property
+    def is_on(self) -> bool:
+        return self.cfg.mask != "off"
 
     def look(self, pick: Tensor) -> Tensor:
         """Logits (B,1,m,m) of photos (B,)."""
@@ -764,13 +756,12 @@ class TransientMask(nn.Module):
 
     def objective(self, pick: Tensor) -> tuple[Tensor, Tensor]:
         """The terms of Eq. 5 that hold M, over all pixels of photos (B,) that rays have seen, and
-        L_GPL alone. [D14] Eq. 5 is linear in M: M = 1 costs a pixel its intensity and GPL and saves
-        it its error. As a sigmoid hardly moves at 0 or 1, price times M is minimised through its
-        logistic surrogate: the same sign, so the same optimum, but a slope that never vanishes.
-        Errors are signed means over 3x3 pixels, of the worst channel: what a blurred model lacks
-        cancels, people do not. Pixels that show SfM points are scene: their own error never counts
-        for M = 1, but tells what is usual. The price lies above: at first, and in fine detail, the
-        scene is wrong. --mask printed has none of this: mean M^2 is the price of saved errors."""
+        L_GPL alone. [D14] M = 1 costs a pixel its price and saves it its error; as a sigmoid hardly
+        moves at 0 or 1, their difference times M is minimised through its logistic surrogate: same
+        sign, same optimum, a slope that never vanishes. Errors are signed means over 3x3 pixels, of
+        the worst channel: what a blurred model lacks cancels, people do not. At pixels that show
+        SfM points M saves nothing; their errors tell what is usual, and the price lies above it.
+        --mask printed has none of this: mean M^2 is the price of saved errors."""
         cfg, logits, phi = self.cfg, self.look(pick), self.phi(pick)  # (B,1,m,m)
         self.logits[pick] = logits.detach()
         residual, known = self.seen[pick, :3], (self.seen[pick, 4:] >= 0).float()  # (B,3 or 1,m,m)
@@ -814,7 +805,8 @@ class GeoNVS(nn.Module):
 
     def __init__(self, cfg: Config, scene: Scene):
         super().__init__()
-        self.cfg, self.scene, raw, dev = cfg, scene, scene.raw, scene.c2w.device
+        self.cfg = cfg = replace(cfg)  # a copy, as --mask auto is decided in the end
+        self.scene, raw, dev = scene, scene.raw, scene.c2w.device
         inside = scene.points.norm(dim=1) < 1
         self.sfm = scene.points[inside]  # (K,3)
         levels = cfg.levels or levels_for_footprint(float(raw["footprint"]))
@@ -881,9 +873,9 @@ class GeoNVS(nn.Module):
         total = torch.stack([terms[name] for name in TERMS]) @ self.lam
         with torch.no_grad():  # what refining and the mask will want to know
             pixel = out["depth"] / self.scene.K[rays.img, 0]  # (R,) its size at the ray's end
-            told = torch.stack([kept, pixel], 1)  # (R,2)
+            hits = torch.cat([out["x"], kept[:, None], pixel[:, None]], 1)  # (R,5)
             first = step * R % len(self.hits)
-            self.hits[first:first + R] = torch.cat([out["x"], told], 1).nan_to_num(2, 2, 2)
+            self.hits[first:first + R] = hits.nan_to_num(2, 2, 2)
             bend = cfg.lam_grad * out["e_grad"] + cfg.lam_lap * e_curv  # (R,) [D3]
             self.mask.remember(rays, residual, bend, out["opacity"])
         if self.mask.is_on and step % MASK_EVERY == 0:
@@ -922,31 +914,25 @@ class GeoNVS(nn.Module):
     @torch.no_grad()
     def plan(self, is_last: bool) -> dict:
         """How to fit the model to the scene: split keys, and at last whether a mask is needed."""
-        keys, has_mask = self.sdf.octree.split_keys, self.mask.is_on
+        keys, mask = self.sdf.octree.split_keys, self.cfg.mask
         if self.cfg.grid == "octree":
             zeta = float(self.deviation())
             keys = refined_keys(self.sdf.octree, self.distance, self.hits, zeta, self.cfg.max_mb)
-        if is_last and self.cfg.mask == "auto" and has_mask:
+        if is_last and mask == "auto":
             share = self.mask.logits[~self.scene.is_test].sigmoid().mean().item()
-            has_mask = share > 0.01
-            print(f"  mean mask {share:.4f}: mask {'stays on' if has_mask else 'goes off'}")
-        return dict(keys=[k.cpu() for k in keys], has_mask=has_mask)
+            mask = "on" if share > 0.01 else "off"
+            print(f"  mean mask {share:.4f}: mask {mask}")
+        return dict(keys=[k.cpu() for k in keys], mask=mask)
 
     def follow(self, plan: dict, optimizer: torch.optim.Optimizer) -> None:
         """Carries out a plan; Adam's moments move along with their features."""
-        octree, self.mask.is_on = self.sdf.octree, plan["has_mask"]
+        octree, self.cfg.mask = self.sdf.octree, plan["mask"]
         old = octree.features
         old_row = octree.build([k.to(old.device) for k in plan["keys"]])
         moments = optimizer.state.pop(old, {}).items()
         optimizer.state[octree.features] = {k: v[old_row] if v.dim() else v for k, v in moments}
         for group in optimizer.param_groups:
             group["params"] = [octree.features if p is old else p for p in group["params"]]
-
-    def get_extra_state(self) -> bool:
-        return self.mask.is_on
-
-    def set_extra_state(self, state: bool) -> None:
-        self.mask.is_on = bool(state) and self.cfg.mask != "off"
 
     def codes(self) -> Tensor:
         """Appearance codes (I,A) of all photos."""
@@ -961,62 +947,42 @@ class GeoNVS(nn.Module):
 # ---- 8 Energy ------------------------------------------------------------------------------------
 
 class EnergyMeter:
-    """Joules from tick to tick: counter() returns joules so far, or power() watts, which are
-    integrated by the trapezoid rule. With neither, joules is None, never 0."""
-    def __init__(self, source=None, counter=None, power=None, clock=time.monotonic):
-        self.source, self.counter, self.power, self.clock = source, counter, power, clock
-        self.joules, self.last = 0.0 if counter or power else None, None
+    """Joules that counter() has counted from tick to tick; None, never 0, if nothing counts. A
+    counter that starts again from zero between two ticks loses what it counted there."""
+    def __init__(self, source=None, counter=None):
+        self.source, self.counter, self.last = source, counter, None
+        self.joules = 0.0 if counter else None
 
-    def tick(self, period: float = 0.0) -> None:
-        """Adds what was spent since the last reading, if that is `period` seconds ago. A reading
-        that fails ends metering, not the run."""
-        now = self.clock()
-        if self.joules is None or self.last and now < self.last[0] + period:
+    def tick(self) -> None:
+        """Adds what was spent since the last tick. A failing reading ends metering, not the run."""
+        if self.joules is None:
             return
         try:
-            value = (self.counter or self.power)()
+            now = self.counter()
+            self.joules += max(0.0, now - (now if self.last is None else self.last))
+            self.last = now
         except Exception as error:  # drivers raise what they like
             print(f"  energy is null, as it could not be read any more ({error})")
             self.source = self.joules = None
-            return
-        if self.last:
-            then, before = self.last
-            self.joules += value - before if self.counter else (value + before) / 2 * (now - then)
-        self.last = now, value
 
 
-def rapl_meter(root: str = "/sys/class/powercap") -> EnergyMeter:
-    """Processor packages through RAPL where readable (often by root only), or no source."""
-    packages = [p for p in sorted(Path(root).glob("intel-rapl:*"))
-                if p.name.count(":") == 1 and os.access(p / "energy_uj", os.R_OK)]
-
-    def read(name):
-        return np.array([int((p / name).read_text()) for p in packages])
-    wraps, last, total = read("max_energy_range_uj"), read("energy_uj"), 0
-
-    def counter():  # each package wraps on its own
-        nonlocal last, total
-        now = read("energy_uj")
-        total, last = total + int(((now - last) % wraps).sum()), now
-        return total / 1e6
-    return EnergyMeter("rapl counter, read every 0.5 s", counter) if packages else EnergyMeter()
-
-
-def make_meter(device: torch.device) -> EnergyMeter:
-    """NVML for a GPU, found by UUID whatever CUDA_VISIBLE_DEVICES says; RAPL for a CPU; or none."""
+def make_meter(device: torch.device, rapl: str = "/sys/class/powercap") -> EnergyMeter:
+    """A GPU's counter through NVML (Volta and newer), whatever CUDA_VISIBLE_DEVICES says; for a CPU
+    that of its packages, where readable (often by root only); or none."""
+    files = [p / "energy_uj" for p in Path(rapl).glob("intel-rapl:*") if p.name.count(":") == 1]
     if device.type != "cuda":
-        return EnergyMeter("rapl", float) if LOCAL_RANK else rapl_meter()  # one reads for a machine
+        if LOCAL_RANK or not files or not all(os.access(p, os.R_OK) for p in files):
+            return EnergyMeter("rapl", float) if LOCAL_RANK else EnergyMeter()  # one per machine
+        return EnergyMeter("rapl counter, read every 5 s", lambda: (
+            sum(int(p.read_text()) for p in files) / 1e6))
     try:
         import pynvml
         pynvml.nvmlInit()
         uuid = torch.cuda.get_device_properties(device).uuid
         gpu = pynvml.nvmlDeviceGetHandleByUUID(f"GPU-{uuid}")
-        for name, read in (("counter", pynvml.nvmlDeviceGetTotalEnergyConsumption),
-                           ("power", pynvml.nvmlDeviceGetPowerUsage)):  # both in thousandths
-            with contextlib.suppress(pynvml.NVMLError):  # GPUs before Volta have no counter
-                read(gpu)
-                how = {name: lambda: read(gpu) / 1e3}
-                return EnergyMeter(f"nvml {name}, read every 0.5 s", **how)
+        pynvml.nvmlDeviceGetTotalEnergyConsumption(gpu)
+        return EnergyMeter("nvml counter, read every 5 s", lambda: (
+            pynvml.nvmlDeviceGetTotalEnergyConsumption(gpu) / 1e3))
     except Exception as error:  # not installed, or the driver does not tell
         print(f"  no GPU energy ({error}): pip install nvidia-ml-py")
     return EnergyMeter()
@@ -1041,10 +1007,6 @@ def agreed(value, source: int = 0):
     return box[0]
 
 
-class Diverged(UserError):
-    """Training was stopped, as its losses or gradients were not finite."""
-
-
 def training_step(model, optimizer, photos: Tensor, state: dict, progress: float, gen):
     """One update; the learning rate rises for 20 steps, then follows a cosine down to 5 %. Returns
     the raw terms of the loss, and 1 if a loss or gradient that is not finite made the step void.
@@ -1054,11 +1016,11 @@ def training_step(model, optimizer, photos: Tensor, state: dict, progress: float
     optimizer.zero_grad()
     loss.backward()
     grads = [p.grad for p in model.parameters() if p.grad is not None]
+    flat = nn.utils.parameters_to_vector(grads)
     if RANKS > 1:  # their mean over the processes
-        flat = nn.utils.parameters_to_vector(grads)
         dist.all_reduce(flat)
         nn.utils.vector_to_parameters(flat / RANKS, grads)
-    is_void = ~torch.isfinite(nn.utils.get_total_norm(grads) + loss.detach())
+    is_void = ~torch.isfinite(flat.sum() + loss.detach())
     optimizer.found_inf = is_void.float()  # fused Adam leaves such a step out
     factor = min(1, (state["step"] + 1) / 20) * (0.525 + 0.475 * math.cos(math.pi * progress))
     for group, now in zip(optimizer.param_groups, model.groups()):
@@ -1114,9 +1076,8 @@ def restore(saved: dict, path: Path, model, gen=None) -> torch.optim.Adam:
 
 def train(cfg: Config, scene: Scene, run: Path, saved: dict | None = None, kind=GeoNVS):
     """Trains until cfg.steps or cfg.minutes; writes log.jsonl and checkpoint.pt below run. saved: a
-    checkpoint to go on from; kind: class of the model. Returns model and state (step, refined,
-    seconds, joules, dropped, source)."""
-    begin, checkpoint = time.perf_counter(), run / "checkpoint.pt"
+    checkpoint to go on from; kind: class of the model. Returns model and state."""
+    begin, path = time.perf_counter(), run / "checkpoint.pt"
     torch.set_flush_denormal(True)  # vanishing weights would otherwise slow a CPU down
     torch.manual_seed(cfg.seed)
     gen = torch.Generator(scene.c2w.device).manual_seed(cfg.seed)
@@ -1124,16 +1085,14 @@ def train(cfg: Config, scene: Scene, run: Path, saved: dict | None = None, kind=
     state = dict(step=0, refined=0, seconds=0.0, dropped=0, joules=0.0)
     meter.tick()
     if saved is None:  # nothing of a former run may be taken for this one's
-        for name in ("checkpoint.pt", "log.jsonl", "metrics.json", "panel.png", "mesh.ply",
-                     "film.mp4"):
+        for name in "checkpoint.pt log.jsonl metrics.json panel.png mesh.ply film.mp4".split():
             (run / name).unlink(missing_ok=True)
         model.start(gen)
         optimizer = torch.optim.Adam(model.groups(), **model.adam, fused=True)
     else:
-        optimizer, state = restore(saved, checkpoint, model, gen), state | saved["state"]
+        optimizer, state = restore(saved, path, model, gen), state | saved["state"]
     for value in model.state_dict().values() if RANKS > 1 else ():
-        if torch.is_tensor(value):
-            dist.broadcast(value, 0)
+        dist.broadcast(value, 0)
     if RANK:
         gen.manual_seed(cfg.seed + RANK + RANKS * state["step"])  # own rays for each process
     photos, begin, spent = scene.photos(False), begin - state["seconds"], state["joules"]
@@ -1146,16 +1105,16 @@ def train(cfg: Config, scene: Scene, run: Path, saved: dict | None = None, kind=
         progress = seconds / (60 * cfg.minutes) if cfg.minutes else state["step"] / cfg.steps
         has_diverged = state["step"] % PATIENCE == 0 and int(streak) >= PATIENCE
         is_over = progress >= 1 or is_stopped or has_diverged
-        meter.tick(0 if is_over else 0.5)
         if is_over or seconds > next_line:
+            state["dropped"] = int(dropped)  # waits for a GPU's queue
+            meter.tick()
             joules = [spent, *(agreed(meter.joules, i) for i in range(RANKS))]
-            state |= dict(dropped=int(dropped), source=meter.source,  # waits for a GPU's queue
-                          joules=None if None in joules else sum(joules))
-            state["seconds"] = agreed(time.perf_counter() - begin)
+            state |= dict(joules=None if None in joules else sum(joules), source=meter.source,
+                          seconds=agreed(time.perf_counter() - begin))
             report(model, run / "log.jsonl", progress, state, terms)
             next_line = seconds + 5
         if is_over or seconds > next_save:
-            save_checkpoint(checkpoint, model, optimizer, gen, state)
+            save_checkpoint(path, model, optimizer, gen, state)
             took = time.perf_counter() - begin - state["seconds"]
             next_save = seconds + max(60, 50 * took)  # a large one less often: 2 % of the time
         if is_over:
@@ -1167,11 +1126,14 @@ def train(cfg: Config, scene: Scene, run: Path, saved: dict | None = None, kind=
             model.follow(agreed(model.plan(state["refined"] == len(REFINE_AT))), optimizer)
     signal.signal(signal.SIGINT, handler)
     need(not is_stopped, f"stopped at step {state['step']}; add --resume to go on")
-    if has_diverged:
-        raise Diverged(f"the last {int(streak)} steps had no finite loss or gradient; likely: "
-                       "learning rates too high (try a third of --lr_grid and --lr_net) or broken "
-                       f"poses; {checkpoint} holds the last good weights")
+    need(not has_diverged, f"the last {int(streak)} steps had no finite loss or gradient; likely: "
+         "learning rates too high (try a third of --lr_grid and --lr_net) or broken poses; "
+         f"{path} holds the last good weights")
     return model, state
+
+
+def watt_hours(state: dict) -> dict:
+    return dict(energy_wh=state["joules"] and state["joules"] / 3600)
 
 
 @torch.no_grad()
@@ -1180,11 +1142,10 @@ def report(model, path: Path, progress: float, state: dict, terms: dict) -> None
     gen = torch.Generator(model.scene.c2w.device).manual_seed(0)
     rays, _ = random_rays(model.scene, model.scene.photos(False), 1024, 64, gen)
     out = model.render(rays, model.codes()[rays.img])
-    line = {k: state[k] for k in ("step", "seconds", "dropped")}
-    line |= dict(energy_wh=state["joules"] and state["joules"] / 3600,
-                 psnr=psnr(out["rgb"], rays.rgb))
     more = dict(zeta=model.deviation(), opacity=out["opacity"]) if hasattr(model, "sdf") else {}
+    line = {k: state[k] for k in ("step", "seconds", "dropped")} | watt_hours(state)
     line |= {k: v.mean().item() for k, v in (terms | more).items()}
+    line["psnr"] = psnr(out["rgb"], rays.rgb)
     rate = state["step"] * model.cfg.rays / state["seconds"]
     left = state["seconds"] * (1 / max(progress, 1e-3) - 1) / 60
     shown = "".join(f"  {k} {line[k]:.3g}" for k in ("psnr", "zeta", "mask") if k in line)
@@ -1220,8 +1181,8 @@ def make_lpips(device):
     except Exception as error:  # not installed, or its weights cannot be fetched
         print(f"  lpips is null: pip install lpips, with a network for its weights ({error})")
         return None
-    return lambda *pair: net(*(torch.as_tensor(p, device=device, dtype=torch.float32)
-                               .permute(2, 0, 1)[None] * 2 - 1 for p in pair)).item()
+    as_tensor = functools.partial(torch.as_tensor, device=device, dtype=torch.float32)
+    return lambda *pair: net(*(as_tensor(p).permute(2, 0, 1)[None] * 2 - 1 for p in pair)).item()
 
 
 def half_pixels(scene: Scene, photo: int, left: bool) -> Tensor:
@@ -1302,31 +1263,31 @@ def toy_truth(model, scene: Scene) -> dict:
     training pixel, and mean M on all others; None without a mask."""
     raw, info, surface, mask, occluder = scene.raw, scene.info, [], [], []
     for i in scene.photos(False)[:, None]:
-        first, last = scene.start[int(i):int(i) + 2].tolist()
-        rays = make_rays(scene, i, torch.arange(0, last - first, 5, device=i.device))
-        depth = torch.as_tensor(raw["depth"][first:last:5]).to(i.device, torch.float32)  # (R,)
+        pixels = slice(*scene.start[int(i):int(i) + 2].tolist(), 5)
+        rays = make_rays(scene, i, torch.arange(0, pixels.stop - pixels.start, 5, device=i.device))
+        depth = torch.as_tensor(raw["depth"][pixels]).to(i.device, torch.float32)  # (R,)
         surface.append(rays.at(depth[:, None])[depth.isfinite()][:, 0])  # (P,3)
         mask.append(mask_at(model.mask.look(i), rays.uv).cpu().numpy())
-        occluder.append(raw["occluder"][first:last:5])
+        occluder.append(raw["occluder"][pixels])
     x, gen = torch.cat(surface), torch.Generator().manual_seed(0)
     x = x + 0.02 * torch.randn(x.shape, generator=gen).to(x.device)  # (P,3) around the surface
     x = x[x.norm(dim=1) < 1]
     true = data_prep.toy_sdf(x.cpu().numpy() * raw["scale"] + raw["center"],
                              info["background"], info["landmark"]) / raw["scale"]  # (P,)
     s = torch.cat([model.distance(part) for part in x.split(CHUNK)]).cpu().numpy()  # (P,)
-    error = float(np.abs(s - true)[np.abs(true) < 0.05].mean())
+    scores = dict(sdf_error=float(np.abs(s - true)[np.abs(true) < 0.05].mean()))
     mask, occluder = np.concatenate(mask), np.concatenate(occluder)
     both, union = ((mask > 0.5) & occluder).sum(), ((mask > 0.5) | occluder).sum()
-    has_mask, has_people = model.mask.is_on, occluder.any()
-    return dict(sdf_error=error, mask_iou=float(both / union) if has_mask and has_people else None,
-                mask_static=float(mask[~occluder].mean()) if has_mask else None)
+    is_on, has_people = model.mask.is_on, occluder.any()
+    return scores | dict(mask_iou=float(both / union) if is_on and has_people else None,
+                         mask_static=float(mask[~occluder].mean()) if is_on else None)
 
 
 @torch.no_grad()
-def extract_mesh(model: GeoNVS, resolution: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The surface s = 0 inside the unit sphere: vertices (N,3) in SfM units, faces (M,3), uint8
-    colours (N,3), by marching cubes over `resolution` cells (default: two per finest octree cell,
-    at most 512). Only corners near the surface are evaluated; elsewhere the cache has the sign."""
+def extract_mesh(model: GeoNVS, resolution: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """The surface s = 0 inside the unit sphere: vertices (N,3) in SfM units and faces (M,3), by
+    marching cubes over `resolution` cells (default: two per finest octree cell, at most 512). Only
+    corners near the surface are evaluated; elsewhere the cache has the sign."""
     scene, cache = model.scene, model.cache.volume
     n = resolution or min(round(2 / model.eps), 512)
     line = torch.linspace(-1, 1, n + 1, device=cache.device)
@@ -1337,29 +1298,19 @@ def extract_mesh(model: GeoNVS, resolution: int = 0) -> tuple[np.ndarray, np.nda
         volume[tuple(index.T)] = model.distance(index * (2 / n) - 1.0)
     volume[~is_inside] = 1.0
     if not (volume < 0).any():
-        return np.zeros((0, 3)), np.zeros((0, 3), int), np.zeros((0, 3), np.uint8)
+        return np.zeros((0, 3)), np.zeros((0, 3), int)
     vertices, faces, _, _ = marching_cubes(volume.cpu().numpy(), 0, gradient_direction="descent")
-    x = torch.as_tensor(vertices * (2 / n) - 1, dtype=torch.float32, device=line.device)  # (N,3)
-    code, colors = model.codes()[~scene.is_test].mean(0), []  # (A,)
-    for part in x.split(2 ** 16):
-        _, geo, grad = model.sdf(part, True)
-        normal = F.normalize(grad, dim=1)
-        inputs = [geo, normal, direction_basis(-normal), code.expand(len(part), -1)]
-        colors.append(model.color(torch.cat(inputs, 1)).sigmoid())
-    vertices = x.cpu().numpy() * scene.raw["scale"] + scene.raw["center"]
-    return vertices, faces, to_uint8(torch.cat(colors).cpu().numpy())
+    return (vertices * (2 / n) - 1) * scene.raw["scale"] + scene.raw["center"], faces
 
 
-def write_ply(path: Path, vertices: np.ndarray, faces: np.ndarray, colors: np.ndarray) -> None:
-    """Binary PLY with a colour per vertex."""
-    v = np.empty(len(vertices), [("xyz", "<f4", 3), ("rgb", "u1", 3)])
+def write_ply(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
+    """Binary PLY."""
     f = np.empty(len(faces), [("n", "u1"), ("index", "<i4", 3)])
-    v["xyz"], v["rgb"], f["n"], f["index"] = vertices, colors, 3, faces
-    kinds = [f"float {k}" for k in "xyz"] + [f"uchar {k}" for k in ("red", "green", "blue")]
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(v)}",
-              *[f"property {kind}" for kind in kinds], f"element face {len(f)}",
-              "property list uchar int vertex_indices", "end_header\n"]
-    data = "\n".join(header).encode() + v.tobytes() + f.tobytes()
+    f["n"], f["index"] = 3, faces
+    header = ("ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}",
+              *[f"property float {k}" for k in "xyz"], f"element face {len(f)}",
+              "property list uchar int vertex_indices", "end_header\n")
+    data = "\n".join(header).encode() + vertices.astype("<f4").tobytes() + f.tobytes()
     atomic_write(path, lambda tmp: Path(tmp).write_bytes(data))
 
 
@@ -1368,16 +1319,16 @@ def panel(model, frames: list[tuple[int, str, dict]], width: int = 240) -> np.nd
     normals of the surface and what the mask network says of the photo."""
     rows = []
     for i, name, f in frames:
-        row, tiles = [], {name: f["truth"], "render": f["rgb"]}
+        tiles, height = {name: f["truth"], "render": f["rgb"]}, round(
+            width * f["rgb"].shape[0] / f["rgb"].shape[1])
         if hasattr(model, "sdf"):
             M = to_uint8(model.mask.look([i])[0, 0].sigmoid().detach().cpu().numpy())  # (m,m)
             M = cv2.applyColorMap(M, cv2.COLORMAP_VIRIDIS)[:, :, ::-1] / 255  # (m,m,3)
             tiles |= {"normals": f["normal"] / 2 + 0.5, "mask: yellow is transient": M}
-        height = round(width * f["rgb"].shape[0] / f["rgb"].shape[1])
-        for title, tile in tiles.items():
-            tile = cv2.resize(to_uint8(tile), (width, height), interpolation=cv2.INTER_AREA)
-            row.append(np.pad(tile, ((20, 4), (0, 4), (0, 0)), constant_values=255))
-            cv2.putText(row[-1], title, (2, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.4, (0, 0, 0), 1, 16)
+        row = [np.pad(cv2.resize(to_uint8(tile), (width, height), interpolation=cv2.INTER_AREA),
+                      ((20, 4), (0, 4), (0, 0)), constant_values=255) for tile in tiles.values()]
+        for title, tile in zip(tiles, row):
+            cv2.putText(tile, title, (2, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.4, (0, 0, 0), 1, 16)
         rows.append(np.concatenate(row, 1))
     return np.concatenate(rows)
 
@@ -1385,10 +1336,9 @@ def panel(model, frames: list[tuple[int, str, dict]], width: int = 240) -> np.nd
 def finish(model, scene: Scene, state: dict, run: Path) -> dict:
     """Scores a trained model and writes metrics.json, panel.png and mesh.ply below run."""
     cfg, is_gpu, octrees = model.cfg, scene.c2w.is_cuda, octrees_of(model)
-    cpu = f"cpu, {torch.get_num_threads()} threads"
-    unit = 1 if sys.platform == "darwin" else 1024  # of ru_maxrss
     peak = (torch.cuda.max_memory_allocated() if is_gpu else  # of training, not of scoring
-            resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit)
+            resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+            * (1 if sys.platform == "darwin" else 1024))
     scores = evaluate(model, scene, make_lpips(scene.c2w.device))
     busy = scene.photos(False)
     if hasattr(model, "sdf"):  # training photos with most on the mask
@@ -1402,9 +1352,10 @@ def finish(model, scene: Scene, state: dict, run: Path) -> dict:
     git = ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short", "HEAD"]
     metrics = dict(
         scene=scene.info["scene"], method=model.name, seed=cfg.seed, steps=state["step"],
-        device=torch.cuda.get_device_name() if is_gpu else cpu, **scores,
-        train_seconds=state["seconds"], dropped=state["dropped"],
-        energy_wh=state["joules"] and state["joules"] / 3600, energy_source=state["source"],
+        device=(torch.cuda.get_device_name() if is_gpu else
+                f"cpu, {torch.get_num_threads()} threads"), **scores,
+        train_seconds=state["seconds"], dropped=state["dropped"], **watt_hours(state),
+        energy_source=state["source"],
         rays_per_second=state["step"] * cfg.rays / max(state["seconds"], 1e-9),
         parameters=sum(p.numel() for p in model.parameters()),
         octree_cells=[len(c) for o in octrees[:1] for c in o.cells] or None,
@@ -1427,32 +1378,30 @@ def film(model, scene: Scene, path: Path, rays: float = 4e6) -> None:
     view through the photos' lights. Frames are as large as photos, or as so many rays allow."""
     photos, count = scene.photos(False), 48
     c2w, codes = scene.c2w[photos], model.codes()[photos]
+
+    def between(keys):  # evenly from key to key: (count,...)
+        line = F.interpolate(keys.flatten(1).T[None], count, mode="linear", align_corners=True)
+        return line[0].T.reshape(count, *keys.shape[1:])
     centre = c2w[:, :, 3] - c2w[:, :, 3].mean(0)  # (B,3)
     order = (centre @ torch.linalg.svd(centre)[2][0]).argsort()  # along the axis of their spread
-    view = photos[centre.norm(dim=1).argmin()].item()  # the middle one
-
-    def between(keys):  # smoothly from key to key
-        u = torch.linspace(0, len(keys) - 1, count, device=keys.device)
-        i, f = u.long(), (u % 1).reshape(-1, *[1] * (keys.dim() - 1))
-        after = keys[(i + 1).clamp(max=len(keys) - 1)]
-        return torch.lerp(keys[i], after, f * f * (3 - 2 * f))
     poses = between(c2w[order[::max(1, len(order) // 6)]])  # (count,3,4)
     left, _, right = torch.linalg.svd(poses[:, :, :3])
     poses[:, :, :3] = left @ right  # the nearest rotation
+    view = centre.norm(dim=1).argmin()  # the middle camera
     shots = [(pose, codes.mean(0)) for pose in poses]
-    shots += [(c2w[photos == view][0], code) for code in between(codes)] if codes.numel() else []
-    budget = rays * (50 if codes.is_cuda else 1) / len(shots) / scene.wh[view].prod().item()
-    wh, K, scale = scene.wh.clone(), scene.K.clone(), min(1.0, math.sqrt(budget))
-    wh[view], K[view] = (wh[view] * scale / 2).long() * 2, K[view] * scale  # even, for the codec
+    shots += [(c2w[view], code) for code in between(codes)] if codes.numel() else []
+    wh, K, near = (a[photos[view]][None] for a in (scene.wh, scene.K, scene.near))
+    budget = rays * (50 if wh.is_cuda else 1) / len(shots)
+    scale = min(1.0, math.sqrt(budget / wh.prod().item()))
+    wh, K = (wh * scale / 2).long() * 2, K * scale  # even, for the codec
 
     def write(tmp):
-        video = cv2.VideoWriter(str(tmp), cv2.VideoWriter_fourcc(*"mp4v"), 24, wh[view].tolist())
+        video = cv2.VideoWriter(str(tmp), cv2.VideoWriter_fourcc(*"mp4v"), 24, wh[0].tolist())
         if not video.isOpened():
             raise OSError("OpenCV cannot write mp4 here")
         for pose, code in tell(shots, f"filming {len(shots)} frames"):
-            moved = scene.c2w.clone()
-            moved[view] = pose
-            frame = render_photo(model, scene._replace(c2w=moved, wh=wh, K=K), view, code)["rgb"]
+            one = scene._replace(c2w=pose[None], wh=wh, K=K, near=near)
+            frame = render_photo(model, one, 0, code)["rgb"]
             video.write(np.ascontiguousarray(to_uint8(frame)[:, :, ::-1]))
         video.release()
     atomic_write(path, write)
