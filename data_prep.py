@@ -589,7 +589,7 @@ def download(name, archive_url=ARCHIVE_URL, split_url=SPLIT_URL):
                 pass
             shutil.copy(root / table, Path(temporary, scene, table))
             os.replace(Path(temporary, scene), home)
-    except (tarfile.TarError, EOFError, zlib.error, OSError) as e:
+    except (tarfile.TarError, EOFError, zlib.error, OSError, TypeError) as e:
         raise UserError(f"cannot unpack {archive} ({e}): free space, or delete it and retry") from e
 
 

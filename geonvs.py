@@ -889,12 +889,13 @@ class GeoNVS(nn.Module):
         return random_rays(self.scene, photos, n, self.cfg.photos, gen)
 
     def groups(self) -> list[dict]:
-        """Optimiser groups: features fast, networks and codes slower, zeta and mask apart."""
+        """Optimiser groups: features fast, networks and codes slower, mask and zeta apart, zeta with
+        an eps that lets no vanishing gradient drive it away."""
         grids, mask = [o.features for o in octrees_of(self)], list(self.mask.parameters())
         taken = {id(p) for p in [*grids, *mask, self.deviation.v]}
         nets = [p for p in self.parameters() if id(p) not in taken]
         return [dict(params=nets, lr=self.cfg.lr_net), dict(params=grids, lr=self.cfg.lr_grid),
-                dict(params=[self.deviation.v], lr=self.cfg.lr_zeta),
+                dict(params=[self.deviation.v], lr=self.cfg.lr_zeta, eps=1e-8),
                 dict(params=mask, lr=8e-3)]  # learns in few steps [D14]
 
     def start(self, gen: torch.Generator, steps: int = 200, radius: float = 0.25) -> None:
@@ -1192,10 +1193,10 @@ def half_pixels(scene: Scene, photo: int, left: bool) -> Tensor:
     return pixel[(pixel % w < w // 2) == left]
 
 
-def fit_codes(model, scene: Scene, photos: Tensor, steps: int = 128, n: int = 64) -> Tensor:
-    """Appearance codes (B,A) of unseen photos (B,): Adam on n random rays a step of each left half.
-    [D12] Starts from the mean code of the training photos. The scene stays untouched."""
-    gen = torch.Generator(scene.c2w.device).manual_seed(0)
+def fit_codes(model, scene: Scene, photos: Tensor, steps: int = 128, n: int = 0) -> Tensor:
+    """Appearance codes (B,A) of unseen photos (B,): Adam on n random rays a step of each left half
+    (64, on a GPU 512) [D12], from the mean code of the training photos. The scene stays as it is."""
+    gen, n = torch.Generator(scene.c2w.device).manual_seed(0), n or (512 if photos.is_cuda else 64)
     codes = model.codes()[~scene.is_test].mean(0).expand(len(photos), -1)  # (B,A)
     codes = codes.detach().clone().requires_grad_()
     if codes.numel() == 0:
@@ -1450,8 +1451,11 @@ def check(cfg: Config) -> None:
 
 
 def make_config(given: dict) -> Config:
-    """Config's defaults, then the scene's settings, then flags."""
-    return Config(**({} if given.get("data") else SCENES[given.get("scene", "toy")]) | given)
+    """Config's defaults, then the scene's settings (of a folder the large ones on a GPU), then
+    flags."""
+    has_gpu = given.get("device") != "cpu" and torch.cuda.is_available()
+    of_folder = LARGE if has_gpu else {}
+    return Config(**(of_folder if given.get("data") else SCENES[given.get("scene", "toy")]) | given)
 
 
 def execute(cfg: Config, arrays: dict, run: Path, saved: dict | None = None, kind=GeoNVS) -> dict:
