@@ -93,7 +93,7 @@ class Config:
     alpha: str = opt("neus", "opacity of a section [D1] [D2]", "neus", "printed")
     gpl: str = opt("calibrated", "edge indicator Phi [D3]", "calibrated", "literal")
     lam_eik: float = opt(0.04, "weight of the eikonal loss (Permuto-SDF)")
-    lam_curv: float = opt(1e-3, "weight of the curvature loss, on |lap| eps [D4] [R]")
+    lam_curv: float = opt(3e-3, "weight of the curvature loss, on |lap| eps [D4] [R]")
     lam_gpl: float = opt(0.05, "weight of the geometry-preservation loss (paper)")
     lam_grad: float = opt(10.0, "weight of the eikonal error inside Phi (paper)")
     lam_lap: float = opt(2.0, "weight of the curvature inside Phi (the paper's lambda_curv = 2)")
@@ -254,6 +254,7 @@ class Octree(nn.Module):
         for name, value in zip(("bits", "stride"), zip(*where)):  # (L,1), (L,3)
             value = torch.tensor(value, dtype=torch.int32, device=device).reshape(levels, -1)
             self.register_buffer(name, value, persistent=False)
+        self.register_buffer("trilinear", TRILINEAR.to(device), persistent=False)  # (8,32)
         self.build([self.row_key[:0]] * (levels - 1))
 
     def cell(self, level: int) -> float:
@@ -332,7 +333,7 @@ class Octree(nn.Module):
         one = torch.stack([torch.ones_like(inside), inside], 3).reshape(-1, 3, 2)  # (PL,3,2)
         fx, fy, fz = one[:, 0, :, None, None], one[:, 1, :, None], one[:, 2, None]
         basis = (fx * (fy * fz)[:, None]).reshape(-1, 8)  # (PL,8) 1 z y yz x xz xy xyz
-        w = basis @ resident(TRILINEAR, x.device)[:, :8 * J]  # (PL,8J)
+        w = basis @ self.trilinear[:, :8 * J]  # (PL,8J)
         out = Interpolate.apply(self.features, corner.reshape(-1, 8), w.reshape(-1, J, 8))
         out = out.reshape(P, L, J, self.features.shape[1])
         return F.pad(out, (0, 0, 0, 0, 0, self.levels - L)) if L < self.levels else out
@@ -889,8 +890,8 @@ class GeoNVS(nn.Module):
         return random_rays(self.scene, photos, n, self.cfg.photos, gen)
 
     def groups(self) -> list[dict]:
-        """Optimiser groups: features fast, networks and codes slower, mask and zeta apart, zeta with
-        an eps that lets no vanishing gradient drive it away."""
+        """Optimiser groups: features fast, networks and codes slower, mask and zeta apart: its eps
+        lets no vanishing gradient drive it away."""
         grids, mask = [o.features for o in octrees_of(self)], list(self.mask.parameters())
         taken = {id(p) for p in [*grids, *mask, self.deviation.v]}
         nets = [p for p in self.parameters() if id(p) not in taken]
@@ -1195,7 +1196,7 @@ def half_pixels(scene: Scene, photo: int, left: bool) -> Tensor:
 
 def fit_codes(model, scene: Scene, photos: Tensor, steps: int = 128, n: int = 0) -> Tensor:
     """Appearance codes (B,A) of unseen photos (B,): Adam on n random rays a step of each left half
-    (64, on a GPU 512) [D12], from the mean code of the training photos. The scene stays as it is."""
+    (64, on a GPU 512) [D12], from the mean code of the training photos. The scene stays as is."""
     gen, n = torch.Generator(scene.c2w.device).manual_seed(0), n or (512 if photos.is_cuda else 64)
     codes = model.codes()[~scene.is_test].mean(0).expand(len(photos), -1)  # (B,A)
     codes = codes.detach().clone().requires_grad_()
