@@ -324,7 +324,7 @@ class Octree(nn.Module):
         for level in range(1, self.active):
             nodes.append(self.child.index_select(0, nodes[-1]) + step[:, level])  # (P,)
         corner = self.corner.index_select(0, torch.stack(nodes, 1).flatten())  # (PL,8)
-        return corner.reshape(len(x), -1, 8), at.frac()
+        return corner.reshape(*at.shape[:2], 8), at.frac()
 
     def forward(self, x: Tensor, derivatives: bool = False) -> Tensor:
         """Features (P,L,J,C) at x (P,3); J = 1, or 4: value, its change per cell along x, y, z."""

@@ -2305,7 +2305,7 @@ def test_scores_and_toy_truth_of_a_perfect_model_are_perfect(scene, monkeypatch)
         people += [] if is_test else occluder[::5].tolist()
     want = dict(sdf_error=0.01, mask_iou=np.mean(people), mask_static=1)
     assert g.toy_truth(model, scene) == pytest.approx(want, rel=1e-3)
-    model.cfg.mask = "off"
+    model.mask.is_on = False
     assert (found := g.toy_truth(model, scene))["mask_iou"] is found["mask_static"] is None
 
 
