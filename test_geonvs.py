@@ -1945,7 +1945,7 @@ def before_step(patch, act):
 
 def jump(patch, pause=1e4):
     """Time passes in training steps alone, by default so much that the run reports and saves after each."""
-    now = [0.0]
+    now = [500.0]
     before_step(patch, lambda state: now.append(now[-1] + pause))
     look = lambda: now.append(now[-1] + 1e-3) or now[-1]
     patch.setattr(g, "time", SimpleNamespace(perf_counter=look, monotonic=look))
@@ -2342,6 +2342,11 @@ def test_mesh_of_the_warm_up_sphere_is_that_sphere_closed_looking_outwards_and_r
         empty.distance = lambda x: 0 * x[:, 0] + height
         empty.cache.refresh(empty.distance)
         assert [len(part) for part in g.extract_mesh(empty, 16)] == [0, 0]
+    for axis in range(3):  # a plane is cut off by the sphere
+        empty.distance = lambda x: x[:, axis] - 0.01
+        empty.cache.refresh(empty.distance)
+        x = (g.extract_mesh(empty, 40)[0] - scene.raw["center"]) / scene.raw["scale"]
+        assert 0.9 < np.linalg.norm(x, axis=1).max() < 1.1 and (np.sort(x.min(0))[:2] < -0.9).all() and np.ptp(x[:, axis]) < 0.1
 
 
 @pytest.mark.parametrize("count", [8, 1])
@@ -2353,11 +2358,14 @@ def test_a_film_goes_from_camera_to_camera_and_then_through_the_lights(warm, sce
     g.film(warm, few, path)
     video = g.cv2.VideoCapture(str(path))
     (poses, codes), half = (torch.stack(part) for part in zip(*shots)), len(shots) // 2
-    assert video.get(g.cv2.CAP_PROP_FRAME_COUNT) == len(shots) > 40 and video.read()[1].shape[0] % 2 == 0
+    assert video.get(g.cv2.CAP_PROP_FRAME_COUNT) == len(shots) > 40
+    assert list(video.read()[1].shape[1::-1]) in (scene.wh[photos] // 2 * 2).tolist()  # even, for the codec
     close(poses[:, :, :3] @ poses[:, :, :3].mT, torch.eye(3).expand(len(shots), 3, 3), atol=1e-4)  # rotations
     assert all((scene.c2w[photos] - end).abs().amax((1, 2)).min() < 1e-2 for end in poses[[0, half - 1]])
     assert (poses[half:] == poses[half]).all() and (codes[:half] == codes[0]).all()
     close(codes[[half, -1]], warm.codes()[photos[[0, -1]]], atol=1e-3)
+    g.film(warm, few, path, rays=1e4)
+    assert 0.5e4 < np.prod(g.cv2.VideoCapture(str(path)).read()[1].shape[:2]) * half * 2 <= 1e4
 
 
 # ---- 11 command line, documents ------------------------------------------------------------------------
