@@ -857,7 +857,9 @@ class GeoNVS(nn.Module):
         out = render_rays(self, rays, self.appearance(rays.img), jitter)
         residual, hit = out["rgb"] - rays.rgb, out["hit"]  # (R,3), (R,)
         error = residual.abs().mean(1)  # (R,) L1
-        mask = mask_at(self.mask.logits[pick], rays.uv) if self.mask.is_on else 0 * error  # (R,)
+        mask = torch.zeros_like(error)  # (R,)
+        if self.mask.is_on:
+            mask = mask_at(self.mask.logits[pick], rays.uv)
         kept = (1 - mask) * error  # (R,) what the mask leaves of it
         some = torch.randint(max(len(self.sfm), 1), (n,), generator=gen, device=gen.device)
         sfm = self.sfm[some] if len(self.sfm) else self.sfm  # (n,3) or (0,3)
