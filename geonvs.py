@@ -857,9 +857,8 @@ class GeoNVS(nn.Module):
         out = render_rays(self, rays, self.appearance(rays.img), jitter)
         residual, hit = out["rgb"] - rays.rgb, out["hit"]  # (R,3), (R,)
         error = residual.abs().mean(1)  # (R,) L1
-        mask = torch.zeros_like(error)  # (R,)
-        if self.mask.is_on:
-            mask = mask_at(self.mask.logits[pick], rays.uv)
+        is_on, logits = self.mask.is_on, self.mask.logits[pick]  # (B,1,m,m)
+        mask = mask_at(logits, rays.uv) if is_on else torch.zeros_like(error)  # (R,)
         kept = (1 - mask) * error  # (R,) what the mask leaves of it
         some = torch.randint(max(len(self.sfm), 1), (n,), generator=gen, device=gen.device)
         sfm = self.sfm[some] if len(self.sfm) else self.sfm  # (n,3) or (0,3)
@@ -881,7 +880,7 @@ class GeoNVS(nn.Module):
             self.hits[first:first + R] = hits.nan_to_num(2, 2, 2)
             bend = cfg.lam_grad * out["e_grad"] + cfg.lam_lap * e_curv  # (R,) [D3]
             self.mask.remember(rays, residual, bend, out["opacity"])
-        if self.mask.is_on and step % MASK_EVERY == 0:
+        if is_on and step % MASK_EVERY == 0:
             self.mask.calibrate(bend.detach())
             taught, terms["gpl"] = self.mask.objective(pick)  # lam_mask L_reg + lam_GPL L_GPL
             total = total + taught

@@ -2346,7 +2346,8 @@ def test_mesh_of_the_warm_up_sphere_is_that_sphere_closed_looking_outwards_and_r
         empty.distance = lambda x: x[:, axis] - 0.01
         empty.cache.refresh(empty.distance)
         x = (g.extract_mesh(empty, 40)[0] - scene.raw["center"]) / scene.raw["scale"]
-        assert 0.9 < np.linalg.norm(x, axis=1).max() < 1.1 and (np.sort(x.min(0))[:2] < -0.9).all() and np.ptp(x[:, axis]) < 0.1
+        radius, height = np.linalg.norm(x, axis=1), np.abs(x[:, axis] - 0.01)
+        assert ((height < 1e-3) | (abs(radius - 1) < 0.06)).all() and radius.max() < 1.06 and (x.min(0) < -0.9).all()
 
 
 @pytest.mark.parametrize("count", [8, 1])
