@@ -37,7 +37,7 @@ Where the printed paper is departed from, the line carries its tag:
 """
 from __future__ import annotations
 
-import argparse, contextlib, datetime, functools, io, json, math, os, resource, shutil, signal
+import argparse, datetime, functools, io, json, math, os, resource, shutil, signal
 import subprocess, sys, threading, time
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
