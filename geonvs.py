@@ -211,7 +211,7 @@ VALUE, SLOPE = torch.tensor([[[1.0, 0], [-1, 1]], [[-1, 1], [0, 0]]])  # (2,2) e
 TRILINEAR = torch.cat([torch.kron(x, torch.kron(y, z)) for x, y, z in (
     3 * [VALUE], (SLOPE, VALUE, VALUE), (VALUE, SLOPE, VALUE), (VALUE, VALUE, SLOPE))], 1)
 PINNED = 64  # rows that stay zero, for hanging corners: on one row a GPU would queue their writes
-CHUNK = 4096  # points or rays evaluated at once outside training; more rays on a GPU
+CHUNK = 4096  # points or rays evaluated at once outside training; four times as many on a GPU
 resident = functools.cache(Tensor.to)  # a constant on a device: one copy, as copies make a GPU wait
 
 
@@ -248,94 +248,80 @@ class Octree(nn.Module):
         super().__init__()
         self.half, self.levels, self.root = half, levels, root
         self.features = nn.Parameter(torch.zeros(PINNED, channels, device=device))  # (V,C)
-        self.register_buffer("row_key", torch.arange(PINNED, device=device))  # (V,) level, corner
-        self.register_buffer("scale", root * 2.0 ** torch.arange(levels, device=device))  # (L,)
-        where = [(-1, (root * root, root, 1)), *[(1, (4, 2, 1))] * (levels - 1)]  # root, children
-        for name, value in zip(("bits", "stride"), zip(*where)):  # (L,1), (L,3)
-            value = torch.tensor(value, dtype=torch.int32, device=device).reshape(levels, -1)
-            self.register_buffer(name, value, persistent=False)
-        self.register_buffer("trilinear", TRILINEAR.to(device), persistent=False)  # (8,32)
-        self.build([self.row_key[:0]] * (levels - 1))
+        self.row_key = torch.arange(-PINNED, 0, device=device)  # (V,) the corner that owns a row
+        for name, value in dict(
+                scale=root * 2.0 ** torch.arange(levels), trilinear=TRILINEAR,  # (L,), (8,32)
+                bits=torch.tensor([[-1], *[[1]] * (levels - 1)]).int(),  # (L,1) root, then children
+                stride=torch.tensor([(root ** 2, root, 1), *[(4, 2, 1)] * (levels - 1)]).int(),
+                ).items():
+            self.register_buffer(name, value.to(device), persistent=False)
+        self.build(self.row_key[:0])
 
-    def cell(self, level: int) -> float:
-        """Side of a cell, scene units."""
-        return 2 * self.half / (self.root << level)
+    def cell(self, level):
+        """Side of a cell, scene units. level: a number, or a tensor of them."""
+        return 2 * self.half / (self.root * 2.0 ** level)
 
-    def key(self, ijk: Tensor, level: int) -> Tensor:
-        """One number per cell or corner (...,3) of a level; corners run to resolution inclusive."""
-        n = (self.root << level) + 1
-        return (ijk[..., 0] * n + ijk[..., 1]) * n + ijk[..., 2]
+    def key(self, at: Tensor) -> Tensor:
+        """One number for a cell or corner (...,4) level, i, j, k; linear in them."""
+        n = (self.root << self.levels) + 1
+        return ((at[..., 0] * n + at[..., 1]) * n + at[..., 2]) * n + at[..., 3]
 
-    def cell_of(self, x: Tensor, level: int) -> Tensor:
-        """Integer coordinates (P,3) of the cells of a level that hold x (P,3), clamped."""
-        n = self.root << level
-        return ((x / (2 * self.half) + 0.5) * n).long().clamp(0, n - 1)
-
-    def build(self, split_keys: list[Tensor]) -> Tensor:
-        """Makes nodes and corners from the keys of the split cells of each level but the last. New
-        features are zero. Returns the former row (V,) of every row, 0 (a pinned one) if new."""
-        octant = CORNERS.to(self.features.device)
+    def build(self, split_keys: Tensor) -> Tensor:
+        """Makes nodes and corners from the keys of the cells that are split. New features are zero.
+        Returns the former row (V,) of every row, 0 (a pinned one) if new."""
+        octant = CORNERS.to(split_keys.device)  # (8,3)
         ijk = torch.cartesian_prod(*[torch.arange(self.root, device=octant.device)] * 3)  # (N,3)
-        child, corner, n_nodes = [octant.new_zeros(8)], [octant.new_zeros(8, 8)], 8
-        rows, n_rows, self.split_keys, self.cells = [self.row_key[:PINNED]], PINNED, [], []
+        cells, child, n_nodes = [], [octant.new_zeros(8)], 8
         for level in range(self.levels):
-            n = self.root << level
-            self.cells.append(ijk)
+            cells.append(F.pad(ijk, (1, 0), value=level))  # (N,4)
+            is_split = torch.isin(self.key(cells[-1]), split_keys) & (level + 1 < self.levels)
             n_nodes += len(ijk)
-            keys, inverse, count = torch.unique(
-                self.key(ijk, level)[:, None] + self.key(octant, level),  # (N,8), as key is linear
-                return_inverse=True, return_counts=True)
-            at = torch.stack([keys // (n + 1) ** 2, keys // (n + 1), keys], 1) % (n + 1)  # corners
-            free = count == 2 ** ((at > 0) & (at < n)).sum(1)  # all cells around it exist
-            row = torch.where(free, n_rows - 1 + free.cumsum(0), keys % PINNED)
-            corner.append(row[inverse])  # (N,8)
-            rows.append(keys[free] + ((level + 1) << 40))
-            n_rows += len(rows[-1])
-            child.append(torch.zeros_like(ijk[:, 0]))  # (N,) first child
-            if level + 1 < self.levels:
-                is_split = torch.isin(self.key(ijk, level), split_keys[level])  # (N,)
-                self.split_keys.append(self.key(ijk[is_split], level))
-                ijk = (2 * ijk[is_split][:, None] + octant).reshape(-1, 3)  # (N,3) of the next
-                child[-1][is_split] = n_nodes + 8 * torch.arange(len(ijk) // 8, device=ijk.device)
-        row_key = torch.cat(rows)
+            child.append(torch.where(is_split, n_nodes + 8 * (is_split.cumsum(0) - 1), 0))  # (N,)
+            ijk = (2 * ijk[is_split][:, None] + octant).reshape(-1, 3)  # (N,3) of the next level
+        self.cells, self.child = torch.cat(cells), torch.cat(child).int()  # (N,4), (8+N,)
+        self.active = int(self.cells[-1, 0]) + 1  # levels that have cells
+        key, n = self.key(self.cells), (self.root << self.levels) + 1  # (N,)
+        self.split_keys = key[self.child[8:] > 0]
+        keys, inverse, count = torch.unique(key[:, None] + self.key(F.pad(octant, (1, 0))),  # (N,8)
+                                            return_inverse=True, return_counts=True)
+        at = torch.stack([keys // n ** 2, keys // n, keys], 1) % n  # (Q,3) corners
+        last = self.scale[keys // n ** 3, None]  # (Q,1) of their level, on the cube's far faces
+        free = count == 2 ** ((at > 0) & (at < last)).sum(1)  # (Q,) all cells around it exist
+        row = torch.where(free, PINNED - 1 + free.cumsum(0), keys % PINNED)  # (Q,)
+        self.corner = F.pad(row[inverse], (0, 0, 8, 0)).int()  # (8+N,8)
+        row_key = torch.cat([self.row_key[:PINNED], keys[free]])  # (V,)
         old_row = torch.searchsorted(self.row_key, row_key).clamp(max=len(self.row_key) - 1)
         old_row = torch.where(self.row_key[old_row] == row_key, old_row, 0)  # (V,)
         self.features = nn.Parameter(self.features.detach()[old_row])  # (V,C)
         self.row_key = row_key
-        self.child, self.corner = torch.cat(child).int(), torch.cat(corner).int()  # (N,), (N,8)
-        self.active = sum(len(cells) > 0 for cells in self.cells)  # levels that have cells
         return old_row
 
-    def split(self, level: int, ijk: Tensor) -> None:
-        """Splits cells ijk (P,3) of a level; the function stays, as new features are zero."""
-        keys = list(self.split_keys)
-        keys[level] = torch.cat([keys[level], self.key(ijk, level)])
-        self.build(keys)
+    def split(self, cells: Tensor) -> None:
+        """Splits cells (...,4); the function stays, as new features are zero."""
+        self.build(torch.cat([self.split_keys, self.key(cells).flatten()]))
 
     def locate(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Corner rows (P,L,8) of the cells that hold x (P,3), and its place (P,L,3) 0..1 inside, on
-        the levels that have cells."""
+        """Nodes (P,L) that hold x (P,3) on the levels that have cells, 8 + the row in cells or of
+        the null block; and where in each, 0..1 (P,L,3). Outside the cube: the nearest inside."""
         u = (x / (2 * self.half) + 0.5).nan_to_num(0).clamp(0, 1 - 1e-6)  # (P,3)
         at = u[:, None] * self.scale[:self.active, None]  # (P,L,3) in cells
-        ijk = at.int()  # (P,L,3)
-        step = (ijk & self.bits[:self.active]) * self.stride[:self.active]  # (P,L,3)
+        step = (at.int() & self.bits[:self.active]) * self.stride[:self.active]  # (P,L,3)
         step = step.sum(2, dtype=torch.int32)  # (P,L)
         nodes = [8 + step[:, 0]]  # (P,) root cell, then the child of the cell before
         for level in range(1, self.active):
             nodes.append(self.child.index_select(0, nodes[-1]) + step[:, level])  # (P,)
-        corner = self.corner.index_select(0, torch.stack(nodes, 1).flatten())  # (PL,8)
-        return corner.reshape(*at.shape[:2], 8), at.frac()
+        return torch.stack(nodes, 1), at.frac()
 
     def forward(self, x: Tensor, derivatives: bool = False) -> Tensor:
         """Features (P,L,J,C) at x (P,3); J = 1, or 4: value, its change per cell along x, y, z."""
         P, L, J = len(x), self.active, 4 if derivatives else 1
-        corner, inside = self.locate(x)  # (P,L,8), (P,L,3)
+        nodes, inside = self.locate(x)  # (P,L), (P,L,3)
         one = torch.stack([torch.ones_like(inside), inside], 3).reshape(-1, 3, 2)  # (PL,3,2)
         fx, fy, fz = one[:, 0, :, None, None], one[:, 1, :, None], one[:, 2, None]
         basis = (fx * (fy * fz)[:, None]).reshape(-1, 8)  # (PL,8) 1 z y yz x xz xy xyz
-        w = basis @ self.trilinear[:, :8 * J]  # (PL,8J)
-        out = Interpolate.apply(self.features, corner.reshape(-1, 8), w.reshape(-1, J, 8))
-        out = out.reshape(P, L, J, self.features.shape[1])
+        w = (basis @ self.trilinear[:, :8 * J]).reshape(-1, J, 8)  # (PL,J,8)
+        corner = self.corner.index_select(0, nodes.flatten())  # (PL,8)
+        out = Interpolate.apply(self.features, corner, w).reshape(P, L, J, self.features.shape[1])
         return F.pad(out, (0, 0, 0, 0, 0, self.levels - L)) if L < self.levels else out
 
     def bytes(self) -> int:
@@ -346,12 +332,11 @@ class Octree(nn.Module):
 def seed_octree(octree: Octree, points: Tensor, dense: int) -> None:
     """Random features; all cells of the first `dense` levels split, of the next those near points
     (P,3) and their neighbours, so that no corner around a point is hanging. [D10]"""
-    for level in range(min(dense, octree.levels - 1)):
-        octree.split(level, octree.cells[level])
-    if dense < octree.levels - 1:
-        step = torch.cartesian_prod(*[torch.arange(-1, 2, device=points.device)] * 3)  # (27,3)
-        ijk = (octree.cell_of(points, dense)[:, None] + step).reshape(-1, 3)  # (27P,3)
-        octree.split(dense, ijk.clamp(0, (octree.root << dense) - 1))
+    for _ in range(dense):
+        octree.split(octree.cells)
+    step = torch.cartesian_prod(*[torch.arange(-1, 2, device=points.device)] * 3)  # (27,3)
+    home = octree.cells[octree.locate(points)[0][:, -1] - 8]  # (P,4)
+    octree.split(home[:, None] + F.pad(step, (1, 0)))
     octree.features.data[PINNED:].normal_(0, 0.01)
 
 
@@ -366,34 +351,32 @@ HIDDEN = 6.0  # zeta |s| from where on the field is not seen: sigmoid(-6) = 0.00
 
 
 @torch.no_grad()
-def refined_keys(octree: Octree, sdf, hits: Tensor, zeta: float, max_mb: float) -> list[Tensor]:
+def refined_keys(octree: Octree, sdf, hits: Tensor, zeta: float, max_mb: float) -> Tensor:
     """Split keys that fit the octree to the scene. sdf: (P,3) to (P,); hits (P,5): where recent
     rays ended, their error, a pixel's size there; 2 where none was. A cell at the surface is split
     if enough rays end in it, they miss their colour, and the children are not finer than pixels;
     worst first, as far as max_mb allows. It is merged if nothing of it, nor within a child's side,
     is nearer to the surface than HIDDEN / zeta: pixels change by at most 2 sigmoid(-HIDDEN)."""
-    keys, hits = list(octree.split_keys), hits[hits[:, 4] != 2]  # (P,5)
-    bound = SPLIT_ERROR * hits[:, 3].sort()[0][len(hits) // 4:][:1]  # (1,), or (0,) without hits
-    hits = hits[hits[:, :3].norm(dim=1) < 1]  # (P,5) rays that miss the sphere split no cells
-    split_bytes = 8 * (36 + 4 * octree.features.shape[1])  # nodes, and as many corners
-    room = int(max(0, max_mb * 2 ** 20 - octree.bytes()) // split_bytes)
-    for level in range(min(octree.active, octree.levels - 1) if len(hits) else 0):
-        side, key = octree.cell(level), octree.key(octree.cells[level], level)  # (N,)
-        centre = (octree.cells[level] + 0.5) * side - octree.half  # (N,3)
-        s = torch.cat([sdf(x) for x in centre.split(CHUNK)]).abs()  # (N,)
-        reach = (math.sqrt(3) / 2 + 1) * side
-        keys[level] = keys[level][torch.isin(keys[level], key[s < reach + HIDDEN / zeta])]
-        hit, which, count = octree.key(octree.cell_of(hits[:, :3], level), level).unique(
-            return_inverse=True, return_counts=True)  # (Q,), (P,), (Q,)
-        mean = hits.new_zeros(len(hit), 2).index_add_(0, which, hits[:, 3:]) / count[:, None]
-        error, pixel = mean.unbind(1)  # (Q,)
-        pays = (count >= SPLIT_RAYS) & (error > bound) & (pixel < side / 2)  # (Q,)
-        pays &= torch.isin(hit, key[s < reach]) & ~torch.isin(hit, keys[level])
-        worst = error.argsort(descending=True)  # (Q,)
-        new = hit[worst[pays[worst]]][:room]
-        room -= len(new)
-        keys[level] = torch.cat([keys[level], new])
-    return keys
+    is_inside = hits[:, :3].norm(dim=1) < 1  # (P,) rays that miss the sphere split no cells
+    if not is_inside.any():
+        return octree.split_keys
+    errors, hits = hits[hits[:, 4] != 2, 3].sort()[0], hits[is_inside]  # (Q,) of all rays, (P,5)
+    cells = octree.cells[octree.cells[:, 0] < octree.levels - 1]  # (N,4) all but the finest
+    side, is_split = octree.cell(cells[:, 0]), octree.child[8:8 + len(cells)] > 0  # (N,)
+    centre = (cells[:, 1:] + 0.5) * side[:, None] - octree.half  # (N,3)
+    s = torch.cat([sdf(x) for x in centre.split(CHUNK)]).abs()  # (N,)
+    reach = (math.sqrt(3) / 2 + 1) * side  # (N,)
+    is_split &= s < reach + HIDDEN / zeta
+    nodes, bound = octree.locate(hits[:, :3])[0], SPLIT_ERROR * errors[len(errors) // 4]  # (P,L)
+    found = F.pad(hits[:, 3:], (0, 1), value=1.0).repeat_interleave(nodes.shape[1], 0)  # (PL,3)
+    found = hits.new_zeros(len(octree.child), 3).index_add_(0, nodes.flatten(), found)  # (8+N,3)
+    error, pixel, count = found[8:8 + len(cells)].unbind(1)  # (N,) sums
+    pays = (count >= SPLIT_RAYS) & (error > bound * count) & (pixel < count * side / 2)  # (N,)
+    pays &= (s < reach) & ~is_split
+    room = max(0.0, max_mb * 2 ** 20 - octree.bytes()) / (8 * (36 + 4 * octree.features.shape[1]))
+    worst = torch.where(pays, error / count, 0).argsort(descending=True)  # (N,) nan: no ray
+    is_split[worst[:min(int(room), int(pays.sum()))]] = True
+    return octree.key(cells[is_split])
 
 
 # ---- 4 Fields: the networks on top of the octree -------------------------------------------------
@@ -917,21 +900,21 @@ class GeoNVS(nn.Module):
     @torch.no_grad()
     def plan(self, is_last: bool) -> dict:
         """How to fit the model to the scene: split keys, and at last whether a mask is needed."""
-        keys, mask = self.sdf.octree.split_keys, self.cfg.mask
-        if self.cfg.grid == "octree":
-            zeta = float(self.deviation())
-            keys = refined_keys(self.sdf.octree, self.distance, self.hits, zeta, self.cfg.max_mb)
+        cfg, octree, zeta, mask = self.cfg, self.sdf.octree, float(self.deviation()), self.cfg.mask
+        keys = octree.split_keys
+        if cfg.grid == "octree":
+            keys = refined_keys(octree, self.distance, self.hits, zeta, cfg.max_mb)
         if is_last and mask == "auto":
             share = self.mask.logits[~self.scene.is_test].sigmoid().mean().item()
             mask = "on" if share > 0.01 else "off"
             print(f"  mean mask {share:.4f}: mask {mask}")
-        return dict(keys=[k.cpu() for k in keys], mask=mask)
+        return dict(keys=keys.cpu(), mask=mask)
 
     def follow(self, plan: dict, optimizer: torch.optim.Optimizer) -> None:
         """Carries out a plan; Adam's moments move along with their features."""
         octree, self.cfg.mask = self.sdf.octree, plan["mask"]
         old = octree.features
-        old_row = octree.build([k.to(old.device) for k in plan["keys"]])
+        old_row = octree.build(plan["keys"].to(old.device))
         moments = optimizer.state.pop(old, {}).items()
         optimizer.state[octree.features] = {k: v[old_row] if v.dim() else v for k, v in moments}
         for group in optimizer.param_groups:
@@ -971,24 +954,26 @@ class EnergyMeter:
 
 def make_meter(device: torch.device, rapl: str = "/sys/class/powercap") -> EnergyMeter:
     """A GPU's counter through NVML (Volta and newer), whatever CUDA_VISIBLE_DEVICES says; for a CPU
-    that of its packages, where readable (often by root only); or none."""
-    files = [p / "energy_uj" for p in Path(rapl).glob("intel-rapl:*") if p.name.count(":") == 1]
-    if device.type != "cuda":
-        if LOCAL_RANK or not files or not all(os.access(p, os.R_OK) for p in files):
-            return EnergyMeter("rapl", float) if LOCAL_RANK else EnergyMeter()  # one per machine
-        return EnergyMeter("rapl counter, read every 5 s", lambda: (
-            sum(int(p.read_text()) for p in files) / 1e6))
+    that of its packages, where readable (often by root only); or none, and a line that says why."""
     try:
-        import pynvml
-        pynvml.nvmlInit()
-        uuid = torch.cuda.get_device_properties(device).uuid
-        gpu = pynvml.nvmlDeviceGetHandleByUUID(f"GPU-{uuid}")
-        pynvml.nvmlDeviceGetTotalEnergyConsumption(gpu)
-        return EnergyMeter("nvml counter, read every 5 s", lambda: (
-            pynvml.nvmlDeviceGetTotalEnergyConsumption(gpu) / 1e3))
-    except Exception as error:  # not installed, or the driver does not tell
-        print(f"  no GPU energy ({error}): pip install nvidia-ml-py")
-    return EnergyMeter()
+        if device.type == "cuda":
+            import pynvml
+            pynvml.nvmlInit()
+            uuid = torch.cuda.get_device_properties(device).uuid
+            gpu = pynvml.nvmlDeviceGetHandleByUUID(f"GPU-{uuid}")
+            read = lambda: pynvml.nvmlDeviceGetTotalEnergyConsumption(gpu) / 1e3  # mJ
+        elif LOCAL_RANK:  # one process reads for a machine
+            read = float
+        else:
+            packages = [p for p in Path(rapl).glob("intel-rapl:*") if p.name.count(":") == 1]
+            need(packages, f"no counter in {rapl}")
+            read = lambda: sum(int((p / "energy_uj").read_text()) for p in packages) / 1e6
+        read()
+        source = "nvml" if device.type == "cuda" else "rapl"
+        return EnergyMeter(f"{source} counter, read every 5 s", read)
+    except Exception as error:  # a package, a driver's answer or a permission is missing
+        print(f"  energy is null ({error}); a GPU's needs: pip install nvidia-ml-py")
+        return EnergyMeter()
 
 
 # ---- 9 Training ----------------------------------------------------------------------------------
@@ -1062,7 +1047,7 @@ def restore(saved: dict, path: Path, model, gen=None) -> torch.optim.Adam:
     """Puts a checkpoint's weights into a model, its state into gen; returns its optimiser."""
     try:
         for octree, keys in zip(octrees_of(model), saved["octrees"], strict=True):
-            octree.build([k.to(octree.features.device) for k in keys])
+            octree.build(keys.to(octree.features.device))
         model.load_state_dict(saved["model"])
         optimizer = torch.optim.Adam(model.groups(), **model.adam, fused=True)
         optimizer.load_state_dict(saved["optimizer"])
@@ -1182,10 +1167,10 @@ def make_lpips(device):
         import lpips
         net = lpips.LPIPS(net="alex", verbose=False).to(device)
     except Exception as error:  # not installed, or its weights cannot be fetched
-        print(f"  lpips is null: pip install lpips, with a network for its weights ({error})")
+        print(f"  lpips is null ({error}): pip install lpips, with a network for its weights")
         return None
-    as_tensor = functools.partial(torch.as_tensor, device=device, dtype=torch.float32)
-    return lambda *pair: net(*(as_tensor(p).permute(2, 0, 1)[None] * 2 - 1 for p in pair)).item()
+    as_batch = lambda p: torch.as_tensor(p).to(device, torch.float32).permute(2, 0, 1)[None]
+    return lambda *pair: net(*map(as_batch, pair), normalize=True).item()  # 0..1 to -1..1
 
 
 def half_pixels(scene: Scene, photo: int, left: bool) -> Tensor:
@@ -1224,8 +1209,7 @@ def render_photo(model, scene: Scene, photo: int, code: Tensor) -> dict[str, np.
     `truth` (H,W,3)."""
     w, h = scene.wh[photo].tolist()
     img = torch.tensor([photo], device=scene.c2w.device)
-    free = torch.cuda.mem_get_info()[0] if img.is_cuda else 0
-    parts, n = [], int(np.clip(free // 2 ** 20, CHUNK, 2 ** 18))  # a ray of NeRF-W: 0.6 MiB
+    parts, n = [], 4 * CHUNK if img.is_cuda else CHUNK  # a ray of NeRF-W takes 0.6 MiB
     for pixel in torch.arange(w * h, device=img.device).split(n):
         rays = make_rays(scene, img.expand(len(pixel)), pixel)
         out = model.render(rays, code.expand(len(pixel), -1)) | dict(truth=rays.rgb)
@@ -1261,29 +1245,31 @@ def evaluate(model, scene: Scene, lpips=None) -> dict:
 
 @torch.no_grad()
 def toy_truth(model, scene: Scene) -> dict:
-    """What only a synthetic scene can tell. sdf_error: mean |s - s_true| within 0.05 of visible
-    surfaces, scene units. mask_iou, _static: M > 0.5 against the true occluders over every fifth
-    training pixel, and mean M on all others; None without a mask."""
-    raw, info, surface, mask, occluder = scene.raw, scene.info, [], [], []
-    for i in scene.photos(False)[:, None]:
-        pixels = slice(*scene.start[int(i):int(i) + 2].tolist(), 5)
-        rays = make_rays(scene, i, torch.arange(0, pixels.stop - pixels.start, 5, device=i.device))
-        depth = torch.as_tensor(raw["depth"][pixels]).to(i.device, torch.float32)  # (R,)
-        surface.append(rays.at(depth[:, None])[depth.isfinite()][:, 0])  # (P,3)
-        mask.append(mask_at(model.mask.look(i), rays.uv).cpu().numpy())
-        occluder.append(raw["occluder"][pixels])
-    x, gen = torch.cat(surface), torch.Generator().manual_seed(0)
-    x = x + 0.02 * torch.randn(x.shape, generator=gen).to(x.device)  # (P,3) around the surface
+    """What only a toy can tell, from every fifth training pixel. sdf_error: mean |s - s_true|
+    within 0.05 of visible surfaces, scene units. mask_iou, mask_static: M > 0.5 against the true
+    occluders, and mean M on all others; None without a mask."""
+    raw, info, gen = scene.raw, scene.info, torch.Generator().manual_seed(0)
+    img = torch.arange(len(scene.wh), device=scene.wh.device).repeat_interleave(scene.start.diff())
+    pixel = torch.nonzero(~scene.is_test[img])[::5, 0]  # (R,)
+    rays = make_rays(scene, img[pixel], pixel - scene.start[img[pixel]])
+    depth = torch.as_tensor(raw["depth"]).to(rays.d)[pixel]  # (R,)
+    x = rays.at(depth[:, None])[depth.isfinite(), 0]  # (P,3)
+    x = x + 0.02 * torch.randn(x.shape, generator=gen).to(x)  # around the surface
     x = x[x.norm(dim=1) < 1]
     true = data_prep.toy_sdf(x.cpu().numpy() * raw["scale"] + raw["center"],
                              info["background"], info["landmark"]) / raw["scale"]  # (P,)
     s = torch.cat([model.distance(part) for part in x.split(CHUNK)]).cpu().numpy()  # (P,)
-    scores = dict(sdf_error=float(np.abs(s - true)[np.abs(true) < 0.05].mean()))
-    mask, occluder = np.concatenate(mask), np.concatenate(occluder)
-    both, union = ((mask > 0.5) & occluder).sum(), ((mask > 0.5) | occluder).sum()
-    is_on, has_people = model.mask.is_on, occluder.any()
-    return scores | dict(mask_iou=float(both / union) if is_on and has_people else None,
-                         mask_static=float(mask[~occluder].mean()) if is_on else None)
+    scores = dict(sdf_error=float(np.abs(s - true)[np.abs(true) < 0.05].mean()),
+                  mask_iou=None, mask_static=None)
+    if model.mask.is_on:
+        mask = torch.cat([mask_at(model.mask.look(i), rays.uv[rays.img == i])
+                          for i in scene.photos(False)[:, None]]).cpu().numpy()  # (R,)
+        occluder = raw["occluder"][pixel.cpu()]  # (R,)
+        union = ((mask > 0.5) | occluder).sum()
+        scores["mask_static"] = float(mask[~occluder].mean())
+        if occluder.any():
+            scores["mask_iou"] = float(((mask > 0.5) & occluder).sum() / union)
+    return scores
 
 
 @torch.no_grad()
@@ -1361,7 +1347,7 @@ def finish(model, scene: Scene, state: dict, run: Path) -> dict:
         energy_source=state["source"],
         rays_per_second=state["step"] * cfg.rays / max(state["seconds"], 1e-9),
         parameters=sum(p.numel() for p in model.parameters()),
-        octree_cells=[len(c) for o in octrees[:1] for c in o.cells] or None,
+        octree_cells=octrees and octrees[0].cells[:, 0].bincount().tolist() or None,
         octree_bytes=octrees[0].bytes() if octrees else None,
         model_bytes=sum(p.numel() * 4 for p in model.parameters()) + sum(
             o.bytes() - 4 * o.features.numel() for o in octrees),
@@ -1379,15 +1365,12 @@ def finish(model, scene: Scene, state: dict, run: Path) -> dict:
 def film(model, scene: Scene, path: Path, rays: float = 4e6) -> None:
     """mp4 at 24 frames/s: a path through the training cameras, from one end to the other, then one
     view through the photos' lights. Frames are as large as photos, or as so many rays allow."""
-    photos, count = scene.photos(False), 48
+    photos = scene.photos(False)
     c2w, codes = scene.c2w[photos], model.codes()[photos]
-
-    def between(keys):  # evenly from key to key: (count,...)
-        line = F.interpolate(keys.flatten(1).T[None], count, mode="linear", align_corners=True)
-        return line[0].T.reshape(count, *keys.shape[1:])
+    between = lambda keys: F.interpolate(keys.T[None], 48, mode="linear", align_corners=True)[0].T
     centre = c2w[:, :, 3] - c2w[:, :, 3].mean(0)  # (B,3)
     order = (centre @ torch.linalg.svd(centre)[2][0]).argsort()  # along the axis of their spread
-    poses = between(c2w[order[::max(1, len(order) // 6)]])  # (count,3,4)
+    poses = between(c2w[order[::max(1, len(order) // 6)]].flatten(1)).reshape(-1, 3, 4)  # (48,3,4)
     left, _, right = torch.linalg.svd(poses[:, :, :3])
     poses[:, :, :3] = left @ right  # the nearest rotation
     view = centre.norm(dim=1).argmin()  # the middle camera
@@ -1396,15 +1379,13 @@ def film(model, scene: Scene, path: Path, rays: float = 4e6) -> None:
     wh, K, near = (a[photos[view]][None] for a in (scene.wh, scene.K, scene.near))
     budget = rays * (50 if wh.is_cuda else 1) / len(shots)
     scale = min(1.0, math.sqrt(budget / wh.prod().item()))
-    wh, K = (wh * scale / 2).long() * 2, K * scale  # even, for the codec
+    one = scene._replace(wh=(wh * scale / 2).long() * 2, K=K * scale, near=near)  # even sides
 
     def write(tmp):
-        video = cv2.VideoWriter(str(tmp), cv2.VideoWriter_fourcc(*"mp4v"), 24, wh[0].tolist())
-        if not video.isOpened():
-            raise OSError("OpenCV cannot write mp4 here")
+        video = cv2.VideoWriter(str(tmp), cv2.VideoWriter_fourcc(*"mp4v"), 24, one.wh[0].tolist())
+        need(video.isOpened(), "OpenCV cannot write mp4 here")
         for pose, code in tell(shots, f"filming {len(shots)} frames"):
-            one = scene._replace(c2w=pose[None], wh=wh, K=K, near=near)
-            frame = render_photo(model, one, 0, code)["rgb"]
+            frame = render_photo(model, one._replace(c2w=pose[None]), 0, code)["rgb"]
             video.write(np.ascontiguousarray(to_uint8(frame)[:, :, ::-1]))
         video.release()
     atomic_write(path, write)
