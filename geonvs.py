@@ -27,7 +27,7 @@ Where the printed paper is departed from, the line carries its tag:
   [D5]  the Lipschitz term is a sum of logs, not a product that can drown the colour at first
   [D6]  CGNet: GroupNorm, ReLU, half the width, negative first bias, head at half resolution
   [D7]  the mask pays mean M, not mean M^2, to go with an L1 error, above what SfM pixels err by
-  [D8]  the background starts where the ray leaves the sphere and its last section is opaque
+  [D8]  the background also fills what lies before the sphere; its last section is opaque
   [D9]  only colour networks run in half precision: it would make noise of distances and normals
   [D10] SfM points place the sphere, seed the octree, pull |s(p)| to zero and teach M = 0
   [D11] samples are drawn from a cached SDF volume; no second network pass along the ray
@@ -79,10 +79,10 @@ class Config:
     rays: int = opt(512, "rays per step, of all processes together")
     photos: int = opt(8, "photos per step; the mask network sees these whole")
     samples: int = opt(16, "foreground samples per ray")
-    bg_samples: int = opt(16, "background samples per ray")
+    bg_samples: int = opt(24, "background samples per ray, a third of them before the sphere")
     levels: int = opt(0, "octree levels, 0: from the pixel footprint at the surface")
     grid: str = opt("octree", "uniform: the same finest cell everywhere", "octree", "uniform")
-    max_mb: float = opt(1000.0, "memory up to which the foreground octree may grow, MiB")
+    max_mb: float = opt(1000.0, "memory of training up to which the octree may grow, MiB")
     hidden: int = opt(64, "width of the MLPs")
     appearance_dim: int = opt(16, "length of a photo's appearance code")
     appearance: str = opt("auto", "codes; auto: on if exposures differ", "auto", "on", "off")
@@ -101,8 +101,8 @@ class Config:
     lam_off: float = opt(1e-3, "weight of the off-surface loss [R]")
     lam_sfm: float = opt(0.3, "weight of |s(p)| at SfM points [D10]")
     lam_mask: float = opt(0.04, "weight of mean M: the excess error that masks a pixel [D7]")
-    lr_grid: float = opt(1e-2, "learning rate of octree features")
-    lr_net: float = opt(2e-3, "learning rate of networks and codes")
+    lr_grid: float = opt(1e-2, "learning rate of octree features and appearance codes")
+    lr_net: float = opt(2e-3, "learning rate of networks")
     lr_zeta: float = opt(1e-3, "learning rate of the deviation network")
 
 
@@ -373,9 +373,10 @@ def refined_keys(octree: Octree, sdf, hits: Tensor, zeta: float, max_mb: float) 
     error, pixel, count = found[8:8 + len(cells)].unbind(1)  # (N,) sums
     pays = (count >= SPLIT_RAYS) & (error > bound * count) & (pixel < count * side / 2)  # (N,)
     pays &= (s < reach) & ~is_split
-    room = max(0.0, max_mb * 2 ** 20 - octree.bytes()) / (8 * (36 + 4 * octree.features.shape[1]))
+    held = 76 + 16 * octree.features.shape[1]  # bytes of a node, and of a row with Adam's moments
+    room = max(0, int(max_mb * 2 ** 20 / held) - len(octree.child)) // 8
     worst = torch.where(pays, error / count, 0).argsort(descending=True)  # (N,) nan: no ray
-    is_split[worst[:min(int(room), int(pays.sum()))]] = True
+    is_split[worst[:min(room, int(pays.sum()))]] = True
     return octree.key(cells[is_split])
 
 
@@ -468,7 +469,7 @@ def contract(x: Tensor) -> Tensor:
 
 
 class Background(nn.Module):
-    """A small NeRF outside the sphere, on an octree over contracted space."""
+    """A small NeRF before the sphere and beyond it, on an octree over contracted space."""
     def __init__(self, octree: Octree, hidden: int, per_ray: int):
         super().__init__()
         self.octree = octree
@@ -477,22 +478,28 @@ class Background(nn.Module):
             nn.Sequential(nn.Linear(a, hidden), nn.ReLU(), nn.Linear(hidden, b))
             for a, b in ((inputs, 1 + GEO), (GEO + per_ray, 3)))
 
-    def forward(self, rays: Rays, start: Tensor, per_ray: Tensor, jitter: Tensor) -> Tensor:
-        """Colour (R,3) beyond start (R,). per_ray: (R,9+A) direction and code; jitter: (R,S) in
-        0..1. [D8] Sections are equal steps of u in t = start + u / (1 - u); the last is opaque."""
-        R, S = jitter.shape
-        u = (torch.arange(S, device=start.device) + jitter) / S  # (R,S) stratified
-        t = start[:, None] + u / (1 - u).clamp(min=1e-3)  # (R,S)
-        x = contract(rays.at(t)).reshape(-1, 3)  # (RS,3)
+    def forward(self, rays: Rays, t0: Tensor, t1: Tensor, per_ray: Tensor, jitter: Tensor):
+        """Colour (R,3) from near to t0 (R,) and the share (R,) that passes it; colour (R,3) beyond
+        t1 (R,). per_ray: (R,9+A) direction and code; jitter: (R,S) in 0..1. [D8] A third of the S
+        sections are equal and end at t0; the others are equal steps of u in t = t1 + u / (1 - u),
+        and the last is opaque."""
+        (R, S), n = jitter.shape, jitter.shape[1] // 3
+        dt = (t0 - rays.near)[:, None] / n  # (R,1)
+        before = rays.near[:, None] + dt * (torch.arange(n, device=t0.device) + jitter[:, :n])
+        u = (torch.arange(S - n, device=t0.device) + jitter[:, n:]) / (S - n)  # (R,S-n)
+        beyond = t1[:, None] + u / (1 - u).clamp(min=1e-3)  # (R,S-n)
+        x = contract(rays.at(torch.cat([before, beyond], 1))).reshape(-1, 3)  # (RS,3)
         feat = torch.cat([x, self.octree(x).flatten(1)], 1)  # (RS,3+LC)
         with half_precision(x):
             density, geo = self.density(feat).float().split([1, GEO], 1)  # (RS,1), (RS,GEO)
             inputs = torch.cat([geo, per_ray.repeat_interleave(S, 0)], 1)  # (RS,GEO+9+A)
             rgb = self.color(inputs).float().sigmoid().reshape(R, S, 3)  # (R,S,3)
         sigma = F.softplus(density.reshape(R, S) - 1)[:, :-1]  # (R,S-1)
-        alpha = F.pad(-torch.expm1(sigma * -torch.diff(t)), (0, 1), value=1.0)  # (R,S)
-        w, _ = composite(alpha)  # (R,S)
-        return (w[:, :, None] * rgb).sum(1)  # (R,3)
+        dt = torch.cat([dt.expand(-1, n), torch.diff(beyond)], 1)  # (R,S-1)
+        alpha = F.pad(-torch.expm1(-sigma * dt), (0, 1), value=1.0)  # (R,S)
+        (w0, passes), (w1, _) = composite(alpha[:, :n]), composite(alpha[:, n:])
+        front, behind = (torch.cat([w0, w1], 1)[:, :, None] * rgb).split([n, S - n], 1)
+        return front.sum(1), passes, behind.sum(1)  # (R,3), (R,), (R,3)
 
 
 # ---- 5 From SDF to colour: sections along the ray, alpha, compositing ----------------------------
@@ -603,16 +610,17 @@ def render_rays(model: "GeoNVS", rays: Rays, code: Tensor, jitter: Tensor) -> di
     per_ray = torch.cat([direction_basis(rays.d), code], 1)  # (R,9+A)
     inputs = torch.cat([geo, normal, per_ray.repeat_interleave(S, 0)], 1)  # (RS,G+3+9+A)
     rgb = (w[:, :, None] * model.color(inputs).sigmoid().reshape(R, S, 3)).sum(1)  # (R,3)
-    behind = model.bg_color  # (3,)
+    front, passes, behind = 0.0, torch.ones_like(trans), model.bg_color  # (3,)
     if model.background is not None:
-        behind = model.background(rays, t1, per_ray, jitter[:, S:])  # (R,3)
+        front, passes, behind = model.background(rays, t0, t1, per_ray, jitter[:, S:])
     eikonal = ((length - 1) ** 2).reshape(R, S)
     with torch.no_grad():
         depth = (w * t).sum(1) + trans * t1  # (R,)
         seen = dict(opacity=1 - trans, depth=depth, x=rays.o + depth[:, None] * rays.d, hit=hit,
                     normal=(w[:, :, None] * normal.reshape(R, S, 3)).sum(1),
                     e_grad=(w * eikonal).sum(1))  # NeuS-weighted [D3]
-    return seen | dict(rgb=rgb + trans[:, None] * behind, eikonal=eikonal)
+    rgb = front + passes[:, None] * (rgb + trans[:, None] * behind)  # (R,3)
+    return seen | dict(rgb=rgb, eikonal=eikonal)
 
 
 # ---- 6 Photos in the wild: transient mask and geometry preservation ------------------------------
@@ -874,12 +882,13 @@ class GeoNVS(nn.Module):
         return random_rays(self.scene, photos, n, self.cfg.photos, gen)
 
     def groups(self) -> list[dict]:
-        """Optimiser groups: features fast, networks and codes slower, mask and zeta apart: its eps
+        """Optimiser groups: what is looked up fast, networks slower, mask and zeta apart: its eps
         lets no vanishing gradient drive it away."""
-        grids, mask = [o.features for o in octrees_of(self)], list(self.mask.parameters())
-        taken = {id(p) for p in [*grids, *mask, self.deviation.v]}
+        tables = [self.appearance.weight, *(o.features for o in octrees_of(self))]
+        mask = list(self.mask.parameters())
+        taken = {id(p) for p in [*tables, *mask, self.deviation.v]}
         nets = [p for p in self.parameters() if id(p) not in taken]
-        return [dict(params=nets, lr=self.cfg.lr_net), dict(params=grids, lr=self.cfg.lr_grid),
+        return [dict(params=nets, lr=self.cfg.lr_net), dict(params=tables, lr=self.cfg.lr_grid),
                 dict(params=[self.deviation.v], lr=self.cfg.lr_zeta, eps=1e-8),
                 dict(params=mask, lr=8e-3)]  # learns in few steps [D14]
 
@@ -888,7 +897,7 @@ class GeoNVS(nn.Module):
         landmark grows to it, one that starts outside also has to be carved out of the sky."""
         nets = [*self.sdf.lin1.parameters(), *self.sdf.lin2.parameters()]
         grid = dict(params=[self.sdf.octree.features], lr=1e-3)
-        adam = torch.optim.Adam([grid, dict(params=nets, lr=5e-3)])
+        adam = torch.optim.Adam([grid, dict(params=nets, lr=5e-3)], fused=True)
         for _ in range(steps):
             x = random_ball(1024, gen)  # (P,3)
             loss = ((self.distance(x) - (x.norm(dim=1) - radius)) ** 2).mean()
