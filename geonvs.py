@@ -22,13 +22,13 @@ Conventions
 Where the printed paper is departed from, the line carries its tag:
   [D1]  alpha is divided by sigmoid(zeta s_prev) and never negative (printed: a wall is 63 % opaque)
   [D2]  the slope correction sits inside zeta, with opposite signs for the two ends of a section
-  [D3]  Phi uses NeuS-weighted errors, |lap| times eps, batch-quantile calibration, and is detached
+  [D3]  Phi: NeuS-weighted errors, |lap| eps, calibrated by quantiles, detached, times opacity
   [D4]  the curvature loss is |lap| times eps: |lap| of a trilinear field grows as eps shrinks
   [D5]  the Lipschitz term is a sum of logs, not a product that can drown the colour at first
   [D6]  CGNet: GroupNorm, ReLU, half the width, negative first bias, head at half resolution
   [D7]  the mask pays mean M, not mean M^2, to go with an L1 error, above what SfM pixels err by
   [D8]  the background also fills what lies before the sphere; its last section is opaque
-  [D9]  only colour networks run in half precision: it would make noise of distances and normals
+  [D9]  colours and background run in half precision; it would make noise of distances and normals
   [D10] SfM points place the sphere, seed the octree, pull |s(p)| to zero and teach M = 0
   [D11] samples are drawn from a cached SDF volume; no second network pass along the ray
   [D12] test photos: appearance fitted on the left half, scored on the right half
@@ -86,7 +86,7 @@ class Config:
     hidden: int = opt(64, "width of the MLPs")
     appearance_dim: int = opt(16, "length of a photo's appearance code")
     appearance: str = opt("auto", "codes; auto: on if exposures differ", "auto", "on", "off")
-    mask: str = opt("auto", "printed: without [D7], [D14]", "auto", "on", "off", "printed")
+    mask: str = opt("auto", "printed: paper's objective", "auto", "on", "off", "printed")
     background: str = opt("auto", "field; auto: off if it is one colour", "auto", "on", "off")
     normals: str = opt("analytic", "derivatives of the SDF [D13]", "analytic", "fd")
     sampling: str = opt("cached", "how samples are placed [D11]", "cached", "uniform")
@@ -211,7 +211,7 @@ VALUE, SLOPE = torch.tensor([[[1.0, 0], [-1, 1]], [[-1, 1], [0, 0]]])  # (2,2) e
 TRILINEAR = torch.cat([torch.kron(x, torch.kron(y, z)) for x, y, z in (
     3 * [VALUE], (SLOPE, VALUE, VALUE), (VALUE, SLOPE, VALUE), (VALUE, VALUE, SLOPE))], 1)
 PINNED = 64  # rows that stay zero, for hanging corners: on one row a GPU would queue their writes
-CHUNK = 4096  # points or rays evaluated at once outside training; four times as many on a GPU
+CHUNK = 4096  # points or rays evaluated at once outside training; of rays 4 times that on a GPU
 resident = functools.cache(Tensor.to)  # a constant on a device: one copy, as copies make a GPU wait
 
 
@@ -232,7 +232,7 @@ class Interpolate(torch.autograd.Function):
         by_corner = w.transpose(1, 2)  # (P,8,J)
         spread = by_corner * grad if w.shape[1] == 1 else torch.bmm(by_corner, grad)  # (P,8,C)
         out = grad.new_zeros(ctx.rows, grad.shape[2])  # (V,C)
-        out.index_add_(0, corner.flatten().long(), spread.flatten(0, 1))  # int: ten times slower
+        out.index_add_(0, corner.flatten().long(), spread.flatten(0, 1))  # a CPU adds slowly by int
         out[:PINNED] = 0  # hanging corners learn nothing
         return out, None, None
 
@@ -288,7 +288,8 @@ class Octree(nn.Module):
         last = self.scale[keys // n ** 3, None]  # (Q,1) of their level, on the cube's far faces
         free = count == 2 ** ((at > 0) & (at < last)).sum(1)  # (Q,) all cells around it exist
         row = torch.where(free, PINNED - 1 + free.cumsum(0), keys % PINNED)  # (Q,)
-        self.corner = F.pad(row[inverse], (0, 0, 8, 0)).int()  # (8+N,8)
+        null = torch.arange(PINNED, device=row.device).reshape(8, 8)  # rows of the null block
+        self.corner = torch.cat([null, row[inverse]]).int()  # (8+N,8)
         row_key = torch.cat([self.row_key[:PINNED], keys[free]])  # (V,)
         old_row = torch.searchsorted(self.row_key, row_key).clamp(max=len(self.row_key) - 1)
         old_row = torch.where(self.row_key[old_row] == row_key, old_row, 0)  # (V,)
@@ -347,7 +348,7 @@ def levels_for_footprint(footprint: float) -> int:
 
 SPLIT_RAYS = 6  # recent rays that end in a cell before it is split
 SPLIT_ERROR = 2.0  # their mean error over the lower quartile of all rays' that splits it
-HIDDEN = 6.0  # zeta |s| from where on the field is not seen: sigmoid(-6) = 0.0025
+HIDDEN = 6.0  # zeta |s| from where on the field is hardly seen: sigmoid(-6) = 0.0025
 
 
 @torch.no_grad()
@@ -356,7 +357,7 @@ def refined_keys(octree: Octree, sdf, hits: Tensor, zeta: float, max_mb: float) 
     rays ended, their error, a pixel's size there; 2 where none was. A cell at the surface is split
     if enough rays end in it, they miss their colour, and the children are not finer than pixels;
     worst first, as far as max_mb allows. It is merged if nothing of it, nor within a child's side,
-    is nearer to the surface than HIDDEN / zeta: pixels change by at most 2 sigmoid(-HIDDEN)."""
+    is nearer to the surface than HIDDEN / zeta, from where on the field is hardly seen."""
     is_inside = hits[:, :3].norm(dim=1) < 1  # (P,) rays that miss the sphere split no cells
     if not is_inside.any():
         return octree.split_keys
@@ -375,8 +376,8 @@ def refined_keys(octree: Octree, sdf, hits: Tensor, zeta: float, max_mb: float) 
     pays &= (s < reach) & ~is_split
     held = 76 + 16 * octree.features.shape[1]  # bytes of a node, and of a row with Adam's moments
     room = max(0, int(max_mb * 2 ** 20 / held) - len(octree.child)) // 8
-    worst = torch.where(pays, error / count, 0).argsort(descending=True)  # (N,) nan: no ray
-    is_split[worst[:min(room, int(pays.sum()))]] = True
+    worst = (error / count)[pays].argsort(descending=True)  # (Q,)
+    is_split[pays.nonzero()[worst[:room], 0]] = True
     return octree.key(cells[is_split])
 
 
@@ -434,7 +435,7 @@ def direction_basis(d: Tensor) -> Tensor:
 
 
 def half_precision(x: Tensor):
-    """bfloat16 for the colour networks, on GPUs that have it. [D9]"""
+    """bfloat16 for colours and background, on GPUs that have it. [D9]"""
     has_it = x.is_cuda and torch.cuda.get_device_capability(x.device) >= (8, 0)
     return torch.autocast(x.device.type, torch.bfloat16, enabled=has_it)
 
@@ -496,7 +497,7 @@ class Background(nn.Module):
             rgb = self.color(inputs).float().sigmoid().reshape(R, S, 3)  # (R,S,3)
         sigma = F.softplus(density.reshape(R, S) - 1)[:, :-1]  # (R,S-1)
         dt = torch.cat([dt.expand(-1, n), torch.diff(beyond)], 1)  # (R,S-1)
-        alpha = F.pad(-torch.expm1(-sigma * dt), (0, 1), value=1.0)  # (R,S)
+        alpha = F.pad(-torch.expm1(-sigma * dt), (0, 1), value=1.0)  # (R,S) [D8]
         (w0, passes), (w1, _) = composite(alpha[:, :n]), composite(alpha[:, n:])
         front, behind = (torch.cat([w0, w1], 1)[:, :, None] * rgb).split([n, S - n], 1)
         return front.sum(1), passes, behind.sum(1)  # (R,3), (R,), (R,3)
@@ -569,7 +570,7 @@ class SDFCache(nn.Module):
         self.volume[0, 0, part::parts] = s.reshape(-1, n, n)
 
     def weights(self, rays: Rays, edges: Tensor, zeta: Tensor) -> Tensor:
-        """NeuS weights (R,N) of sections (R,N+1), a surface being at least as wide as a voxel."""
+        """NeuS weights (R,N) of sections (R,N+1); surfaces are at least half a voxel wide."""
         x = rays.at(edges).flip(-1)[None, None]  # (1,1,R,N+1,3) as grid_sample wants it, z first
         s = F.grid_sample(self.volume, x, padding_mode="border", align_corners=True)[0, 0, 0]
         log_phi = F.logsigmoid(zeta.clamp(max=self.volume.shape[-1]) * s)  # (R,N+1)
@@ -599,8 +600,8 @@ def render_rays(model: "GeoNVS", rays: Rays, code: Tensor, jitter: Tensor) -> di
     x = rays.at(t).reshape(-1, 3)  # (RS,3)
     sdf, geo, grad = model.sdf(x, cfg.normals == "analytic")  # (RS,), (RS,G), (RS,3) [D13]
     if cfg.normals == "fd":
-        s = model.distance(taps(x, model.eps).reshape(-1, 3)).reshape(-1, 5)  # (RS,5)
-        grad, _ = finite_differences(s, model.eps)  # (RS,3)
+        ends = model.distance(taps(x, model.eps)[:, 1:].reshape(-1, 3)).reshape(-1, 4)  # (RS,4)
+        grad, _ = finite_differences(torch.cat([sdf[:, None], ends], 1), model.eps)  # (RS,3)
     length = grad.norm(dim=1, keepdim=True)  # (RS,1)
     normal = grad / (length + 1e-12)  # (RS,3)
     cos = (grad.reshape(R, S, 3) * rays.d[:, None]).sum(2)  # (R,S)
@@ -731,7 +732,8 @@ class TransientMask(nn.Module):
         """Keeps residual (R,3), bend and opacity (R,) where the network will look for them."""
         m = self.seen.shape[-1]
         col, row = (rays.uv * m).long().clamp(max=m - 1).unbind(1)  # (R,)
-        found = torch.cat([residual, bend[:, None], opacity[:, None]], 1)  # (R,5)
+        seen = opacity.clamp(min=0)  # (R,) as printed it may be negative, which would say: no ray
+        found = torch.cat([residual, bend[:, None], seen[:, None]], 1)  # (R,5)
         self.seen[rays.img, :, row, col] = found.nan_to_num(0, 0, 0)
 
     def calibrate(self, bend: Tensor, rate: float = 0.2) -> None:
@@ -744,7 +746,7 @@ class TransientMask(nn.Module):
         """Phi times opacity (B,1,m,m) of photos (B,) as rays found it; 0 where none came."""
         bend, opacity = self.seen[pick, 3:].split(1, 1)  # (B,1,m,m)
         calibration = self.calibration if self.cfg.gpl == "calibrated" else None
-        return opacity.clamp(min=0) * edge_indicator(bend, calibration)
+        return opacity.clamp(min=0) * edge_indicator(bend, calibration)  # [D3]
 
     def objective(self, pick: Tensor) -> tuple[Tensor, Tensor]:
         """The terms of Eq. 5 that hold M, over all pixels of photos (B,) that rays have seen, and
@@ -848,15 +850,16 @@ class GeoNVS(nn.Module):
         out = render_rays(self, rays, self.appearance(rays.img), jitter)
         residual, hit = out["rgb"] - rays.rgb, out["hit"]  # (R,3), (R,)
         error = residual.abs().mean(1)  # (R,) L1
-        is_on, logits = self.mask.is_on, self.mask.logits[pick]  # (B,1,m,m)
-        mask = mask_at(logits, rays.uv) if is_on else torch.zeros_like(error)  # (R,)
+        mask = torch.zeros_like(error)  # (R,)
+        if self.mask.is_on:
+            mask = mask_at(self.mask.logits[pick], rays.uv)
         kept = (1 - mask) * error  # (R,) what the mask leaves of it
         some = torch.randint(max(len(self.sfm), 1), (n,), generator=gen, device=gen.device)
         sfm = self.sfm[some] if len(self.sfm) else self.sfm  # (n,3) or (0,3)
         x = torch.cat([taps(out["x"], self.eps).reshape(-1, 3), random_ball(n, gen), sfm])
         ends, off, sfm = self.distance(x).split([5 * R, n, len(sfm)])  # all points but the samples
         lap = finite_differences(ends.reshape(R, 5), self.eps)[1]  # (R,) where rays end
-        e_curv = lap.abs() * self.eps * out["opacity"]  # (R,) flat, not transparent
+        e_curv = lap.abs() * self.eps * out["opacity"]  # (R,) flat, not transparent [D13]
         terms = dict(rgb=kept.mean(),
                      eik=(out["eikonal"].mean(1) * hit).sum() / hit.sum().clamp(min=1),
                      curv=e_curv.mean(),  # [D4]
@@ -871,8 +874,8 @@ class GeoNVS(nn.Module):
             self.hits[first:first + R] = hits.nan_to_num(2, 2, 2)
             bend = cfg.lam_grad * out["e_grad"] + cfg.lam_lap * e_curv  # (R,) [D3]
             self.mask.remember(rays, residual, bend, out["opacity"])
-        if is_on and step % MASK_EVERY == 0:
-            self.mask.calibrate(bend.detach())
+        if self.mask.is_on and step % MASK_EVERY == 0:
+            self.mask.calibrate(bend)
             taught, terms["gpl"] = self.mask.objective(pick)  # lam_mask L_reg + lam_GPL L_GPL
             total = total + taught
         return total, terms | dict(mask=mask)
@@ -895,9 +898,9 @@ class GeoNVS(nn.Module):
     def start(self, gen: torch.Generator, steps: int = 200, radius: float = 0.25) -> None:
         """Warm-up: L_sphere fits the SDF to a sphere. A small one: a surface that starts inside the
         landmark grows to it, one that starts outside also has to be carved out of the sky."""
-        nets = [*self.sdf.lin1.parameters(), *self.sdf.lin2.parameters()]
-        grid = dict(params=[self.sdf.octree.features], lr=1e-3)
-        adam = torch.optim.Adam([grid, dict(params=nets, lr=5e-3)], fused=True)
+        grid, *nets = self.sdf.parameters()
+        groups = dict(params=[grid], lr=1e-3), dict(params=nets, lr=5e-3)
+        adam = torch.optim.Adam(groups, fused=True)
         for _ in range(steps):
             x = random_ball(1024, gen)  # (P,3)
             loss = ((self.distance(x) - (x.norm(dim=1) - radius)) ** 2).mean()
@@ -993,7 +996,6 @@ PATIENCE = 20  # steps in a row without a finite loss and gradient that stop a r
 # process decides, speaks and writes; so all hold the same weights.
 RANK, LOCAL_RANK, RANKS = (int(os.environ.get(name, default)) for name, default in (
     ("RANK", 0), ("LOCAL_RANK", 0), ("WORLD_SIZE", 1)))
-atomic_write = (lambda path, write: None) if RANK else atomic_write
 
 
 def agreed(value, source: int = 0):
@@ -1013,11 +1015,11 @@ def training_step(model, optimizer, photos: Tensor, state: dict, progress: float
     optimizer.zero_grad()
     loss.backward()
     grads = [p.grad for p in model.parameters() if p.grad is not None]
-    flat = nn.utils.parameters_to_vector(grads)
+    flat = nn.utils.parameters_to_vector([loss.detach()[None], *grads])
     if RANKS > 1:  # their mean over the processes
         dist.all_reduce(flat)
-        nn.utils.vector_to_parameters(flat / RANKS, grads)
-    is_void = ~torch.isfinite(flat.sum() + loss.detach())
+        nn.utils.vector_to_parameters(flat[1:] / RANKS, grads)
+    is_void = ~torch.isfinite(flat.sum())
     optimizer.found_inf = is_void.float()  # fused Adam leaves such a step out
     factor = min(1, (state["step"] + 1) / 20) * (0.525 + 0.475 * math.cos(math.pi * progress))
     for group, now in zip(optimizer.param_groups, model.groups()):
@@ -1044,7 +1046,7 @@ def read_checkpoint(path: Path, given: dict) -> tuple[dict, Config]:
         data_prep.refuse_bomb(path)
         saved = dict(torch.load(path, map_location="cpu", weights_only=True))
         cfg = Config(**saved["config"])
-        check(cfg)
+        check(replace(cfg, rays=cfg.rays * RANKS))  # main checks how many processes share them
         need(saved["state"]["step"] >= 0, "")
     except Exception as error:  # a damaged file can fail in any layer: zip, pickle, tensor storage
         raise UserError(f"{path} is damaged or not a checkpoint of this program "
@@ -1106,14 +1108,16 @@ def train(cfg: Config, scene: Scene, run: Path, saved: dict | None = None, kind=
             state["dropped"] = int(dropped)  # waits for a GPU's queue
             meter.tick()
             joules = [spent, *(agreed(meter.joules, i) for i in range(RANKS))]
-            state |= dict(joules=None if None in joules else sum(joules), source=meter.source,
+            joules = None if None in joules else sum(joules)
+            state |= dict(joules=joules, energy_wh=joules and joules / 3600, source=meter.source,
                           seconds=agreed(time.perf_counter() - begin))
-            report(model, run / "log.jsonl", progress, state, terms)
+            RANK or report(model, run / "log.jsonl", progress, state, terms)
             next_line = seconds + 5
-        if is_over or seconds > next_save:
-            save_checkpoint(path, model, optimizer, gen, state)
-            took = time.perf_counter() - begin - state["seconds"]
-            next_save = seconds + max(60, 50 * took)  # a large one less often: 2 % of the time
+            if is_over or seconds > next_save:
+                saving = time.perf_counter()
+                RANK or save_checkpoint(path, model, optimizer, gen, state)
+                took = time.perf_counter() - saving
+                next_save = seconds + max(60, 50 * took)  # a large one less often: 2 % of the time
         if is_over:
             break
         terms, is_void = training_step(model, optimizer, photos, state, progress, gen)
@@ -1129,10 +1133,6 @@ def train(cfg: Config, scene: Scene, run: Path, saved: dict | None = None, kind=
     return model, state
 
 
-def watt_hours(state: dict) -> dict:
-    return dict(energy_wh=state["joules"] and state["joules"] / 3600)
-
-
 @torch.no_grad()
 def report(model, path: Path, progress: float, state: dict, terms: dict) -> None:
     """A line on the terminal and one in log.jsonl. psnr and opacity: of 1,024 fixed rays."""
@@ -1140,16 +1140,15 @@ def report(model, path: Path, progress: float, state: dict, terms: dict) -> None
     rays, _ = random_rays(model.scene, model.scene.photos(False), 1024, 64, gen)
     out = model.render(rays, model.codes()[rays.img])
     more = dict(zeta=model.deviation(), opacity=out["opacity"]) if hasattr(model, "sdf") else {}
-    line = {k: state[k] for k in ("step", "seconds", "dropped")} | watt_hours(state)
+    line = {k: state[k] for k in ("step", "seconds", "dropped", "energy_wh")}
     line |= {k: v.mean().item() for k, v in (terms | more).items()}
     line["psnr"] = psnr(out["rgb"], rays.rgb)
     rate = state["step"] * model.cfg.rays / state["seconds"]
     left = state["seconds"] * (1 / max(progress, 1e-3) - 1) / 60
     shown = "".join(f"  {k} {line[k]:.3g}" for k in ("psnr", "zeta", "mask") if k in line)
     print(f"  step {state['step']:6d}{shown}  {rate:.0f} rays/s  {left:.1f} min left", flush=True)
-    if not RANK:
-        with open(path, "a") as file:
-            file.write(json.dumps(line) + "\n")
+    with open(path, "a") as file:
+        file.write(json.dumps(line) + "\n")
 
 
 # ---- 10 Scoring, mesh, pictures ------------------------------------------------------------------
@@ -1352,8 +1351,8 @@ def finish(model, scene: Scene, state: dict, run: Path) -> dict:
         scene=scene.info["scene"], method=model.name, seed=cfg.seed, steps=state["step"],
         device=(torch.cuda.get_device_name() if is_gpu else
                 f"cpu, {torch.get_num_threads()} threads"), **scores,
-        train_seconds=state["seconds"], dropped=state["dropped"], **watt_hours(state),
-        energy_source=state["source"],
+        train_seconds=state["seconds"], dropped=state["dropped"],
+        energy_wh=state["energy_wh"], energy_source=state["source"],
         rays_per_second=state["step"] * cfg.rays / max(state["seconds"], 1e-9),
         parameters=sum(p.numel() for p in model.parameters()),
         octree_cells=octrees and octrees[0].cells[:, 0].bincount().tolist() or None,
@@ -1379,7 +1378,8 @@ def film(model, scene: Scene, path: Path, rays: float = 4e6) -> None:
     between = lambda keys: F.interpolate(keys.T[None], 48, mode="linear", align_corners=True)[0].T
     centre = c2w[:, :, 3] - c2w[:, :, 3].mean(0)  # (B,3)
     order = (centre @ torch.linalg.svd(centre)[2][0]).argsort()  # along the axis of their spread
-    poses = between(c2w[order[::max(1, len(order) // 6)]].flatten(1)).reshape(-1, 3, 4)  # (48,3,4)
+    stops = order[torch.linspace(0, len(order) - 1, min(7, len(order))).round().long()]
+    poses = between(c2w[stops].flatten(1)).reshape(-1, 3, 4)  # (48,3,4)
     left, _, right = torch.linalg.svd(poses[:, :, :3])
     poses[:, :, :3] = left @ right  # the nearest rotation
     view = centre.norm(dim=1).argmin()  # the middle camera
@@ -1481,13 +1481,14 @@ def main(argv: list[str] | None = None) -> None:
         dist.init_process_group("cpu:gloo,cuda:nccl" if device.type == "cuda" else "gloo",
                                 timeout=datetime.timedelta(days=1))  # the first scores alone
         sys.stdout = open(os.devnull, "w") if RANK else sys.stdout
-    agreed(RANK or bool(data_prep.open_scene(cfg.data or cfg.scene, cfg.downscale)))
-    arrays = data_prep.open_scene(cfg.data or cfg.scene, cfg.downscale)
+    opened = functools.cache(data_prep.open_scene)
+    agreed(RANK or bool(opened(cfg.data or cfg.scene, cfg.downscale)))  # the first makes the file
+    arrays = opened(cfg.data or cfg.scene, cfg.downscale)
     if render:
         scene = load_scene(arrays, device)
         model = GeoNVS(cfg, scene)
         restore(saved, run / "checkpoint.pt", model)
-        film(model, scene, run / "film.mp4")
+        RANK or film(model, scene, run / "film.mp4")
     else:
         execute(cfg, arrays, run, saved)
 

@@ -1019,6 +1019,7 @@ def test_a_corner_owns_a_row_if_all_its_cells_exist_and_is_pinned_if_not(seed):
     owners, pinned = corners_of(octree), octree.corner[octree.corner < g.PINNED].unique()
     assert len(owners) == len(set(owners)) and set(owners) == want
     assert len(pinned) > g.PINNED / 2 and (octree.features[pinned] == 0).all()  # spread, for a GPU
+    assert octree.corner[:8].flatten().tolist() == list(range(g.PINNED))
     assert octree.bytes() == 8 * octree.features.numel() + 36 * (8 + len(octree.cells))  # float64, int32
 
 
@@ -2200,7 +2201,7 @@ def together():
     train, spent = g.train, itertools.chain([0], itertools.repeat(10 * (g.RANK + 1)))
     with pytest.MonkeyPatch.context() as patch:
         hasten(patch)
-        spoil(patch, lambda step: step == 5 and g.RANK == g.RANKS - 1)  # on one process alone
+        spoil(patch, lambda step: step == 5 and g.RANK == g.RANKS - 1, lambda total, model: total + math.inf)  # on one
         patch.setattr(data_prep, "open_scene", lambda *_: dict(np.load("scene.npz")))
         for name, f in dict(train=kept, fit_codes=lambda model, _, photos: model.codes()[photos],
                             make_meter=lambda device: g.EnergyMeter("fake", spent.__next__)).items():
@@ -2373,6 +2374,8 @@ def test_a_film_goes_from_camera_to_camera_and_then_through_the_lights(warm, sce
     assert list(video.read()[1].shape[1::-1]) in (scene.wh[photos] // 2 * 2).tolist()  # even, for the codec
     close(poses[:, :, :3] @ poses[:, :, :3].mT, torch.eye(3).expand(len(shots), 3, 3), atol=1e-4)  # rotations
     assert all((scene.c2w[photos] - end).abs().amax((1, 2)).min() < 1e-2 for end in poses[[0, half - 1]])
+    eyes, ends = scene.c2w[photos][:, :, 3], poses[[0, half - 1], :, 3]  # from one end to the other
+    assert (ends[0] - ends[1]).norm() > 0.9 * torch.cdist(eyes, eyes).max()
     assert (poses[half:] == poses[half]).all() and (codes[:half] == codes[0]).all()
     close(codes[[half, -1]], warm.codes()[photos[[0, -1]]], atol=1e-3)
     g.film(warm, few, path, rays=1e4)
