@@ -480,14 +480,13 @@ class Background(nn.Module):
             for a, b in ((inputs, 1 + GEO), (GEO + per_ray, 3)))
 
     def forward(self, rays: Rays, t0: Tensor, t1: Tensor, per_ray: Tensor, jitter: Tensor):
-        """Colour (R,3) from near to t0 (R,) and the share (R,) that passes it; colour (R,3) beyond
-        t1 (R,). per_ray: (R,9+A) direction and code; jitter: (R,S) in 0..1. [D8] A third of the S
-        sections are equal and end at t0; the others are equal steps of u in t = t1 + u / (1 - u),
-        and the last is opaque."""
+        """Colour (R,3) from near to t0 (R,), the share (R,) that passes it, and of that the colour
+        (R,3) beyond t1 (R,). per_ray: (R,9+A) direction and code; jitter: (R,S) in 0..1. [D8] A
+        third of the S sections are equal and end at t0; the others are equal steps of u in
+        t = t1 + u / (1 - u), and the last is opaque."""
         (R, S), n = jitter.shape, jitter.shape[1] // 3
-        dt = (t0 - rays.near)[:, None] / n  # (R,1)
-        before = rays.near[:, None] + dt * (torch.arange(n, device=t0.device) + jitter[:, :n])
-        u = (torch.arange(S - n, device=t0.device) + jitter[:, n:]) / (S - n)  # (R,S-n)
+        at, dt = torch.arange(S, device=t0.device) + jitter, (t0 - rays.near)[:, None] / n  # (R,1)
+        before, u = rays.near[:, None] + dt * at[:, :n], (at[:, n:] - n) / (S - n)  # (R,n), (R,S-n)
         beyond = t1[:, None] + u / (1 - u).clamp(min=1e-3)  # (R,S-n)
         x = contract(rays.at(torch.cat([before, beyond], 1))).reshape(-1, 3)  # (RS,3)
         feat = torch.cat([x, self.octree(x).flatten(1)], 1)  # (RS,3+LC)
@@ -498,9 +497,9 @@ class Background(nn.Module):
         sigma = F.softplus(density.reshape(R, S) - 1)[:, :-1]  # (R,S-1)
         dt = torch.cat([dt.expand(-1, n), torch.diff(beyond)], 1)  # (R,S-1)
         alpha = F.pad(-torch.expm1(-sigma * dt), (0, 1), value=1.0)  # (R,S) [D8]
-        (w0, passes), (w1, _) = composite(alpha[:, :n]), composite(alpha[:, n:])
-        front, behind = (torch.cat([w0, w1], 1)[:, :, None] * rgb).split([n, S - n], 1)
-        return front.sum(1), passes, behind.sum(1)  # (R,3), (R,), (R,3)
+        w, _ = composite(alpha)  # (R,S)
+        front, behind = (w[:, :, None] * rgb).split([n, S - n], 1)
+        return front.sum(1), 1 - w[:, :n].sum(1), behind.sum(1)  # (R,3), (R,), (R,3)
 
 
 # ---- 5 From SDF to colour: sections along the ray, alpha, compositing ----------------------------
@@ -611,7 +610,7 @@ def render_rays(model: "GeoNVS", rays: Rays, code: Tensor, jitter: Tensor) -> di
     per_ray = torch.cat([direction_basis(rays.d), code], 1)  # (R,9+A)
     inputs = torch.cat([geo, normal, per_ray.repeat_interleave(S, 0)], 1)  # (RS,G+3+9+A)
     rgb = (w[:, :, None] * model.color(inputs).sigmoid().reshape(R, S, 3)).sum(1)  # (R,3)
-    front, passes, behind = 0.0, torch.ones_like(trans), model.bg_color  # (3,)
+    front, passes, behind = 0, torch.ones_like(trans), model.bg_color  # (3,)
     if model.background is not None:
         front, passes, behind = model.background(rays, t0, t1, per_ray, jitter[:, S:])
     eikonal = ((length - 1) ** 2).reshape(R, S)
@@ -620,7 +619,7 @@ def render_rays(model: "GeoNVS", rays: Rays, code: Tensor, jitter: Tensor) -> di
         seen = dict(opacity=1 - trans, depth=depth, x=rays.o + depth[:, None] * rays.d, hit=hit,
                     normal=(w[:, :, None] * normal.reshape(R, S, 3)).sum(1),
                     e_grad=(w * eikonal).sum(1))  # NeuS-weighted [D3]
-    rgb = front + passes[:, None] * (rgb + trans[:, None] * behind)  # (R,3)
+    rgb = front + passes[:, None] * rgb + trans[:, None] * behind  # (R,3)
     return seen | dict(rgb=rgb, eikonal=eikonal)
 
 
@@ -850,9 +849,8 @@ class GeoNVS(nn.Module):
         out = render_rays(self, rays, self.appearance(rays.img), jitter)
         residual, hit = out["rgb"] - rays.rgb, out["hit"]  # (R,3), (R,)
         error = residual.abs().mean(1)  # (R,) L1
-        mask = torch.zeros_like(error)  # (R,)
-        if self.mask.is_on:
-            mask = mask_at(self.mask.logits[pick], rays.uv)
+        is_on = self.mask.is_on
+        mask = mask_at(self.mask.logits[pick], rays.uv) if is_on else torch.zeros_like(error)
         kept = (1 - mask) * error  # (R,) what the mask leaves of it
         some = torch.randint(max(len(self.sfm), 1), (n,), generator=gen, device=gen.device)
         sfm = self.sfm[some] if len(self.sfm) else self.sfm  # (n,3) or (0,3)
@@ -874,7 +872,7 @@ class GeoNVS(nn.Module):
             self.hits[first:first + R] = hits.nan_to_num(2, 2, 2)
             bend = cfg.lam_grad * out["e_grad"] + cfg.lam_lap * e_curv  # (R,) [D3]
             self.mask.remember(rays, residual, bend, out["opacity"])
-        if self.mask.is_on and step % MASK_EVERY == 0:
+        if is_on and step % MASK_EVERY == 0:
             self.mask.calibrate(bend)
             taught, terms["gpl"] = self.mask.objective(pick)  # lam_mask L_reg + lam_GPL L_GPL
             total = total + taught
