@@ -162,7 +162,7 @@ class Rays(NamedTuple):
 
     def at(self, t: Tensor) -> Tensor:
         """Points (R,S,3) at distances t (R,S)."""
-        return self.o[:, None] + t[:, :, None] * self.d[:, None]
+        return torch.addcmul(self.o[:, None], t[:, :, None], self.d[:, None])
 
 
 def pixel_directions(uv_px: Tensor, K: Tensor) -> Tensor:
@@ -190,16 +190,13 @@ def random_rays(scene: Scene, photos: Tensor, n: int, per_step: int, gen: torch.
     return make_rays(scene, img, (u * scene.wh[img].prod(1)).long()), pick
 
 
-def sphere_interval(rays: Rays) -> tuple[Tensor, Tensor, Tensor]:
-    """t where each ray enters and leaves the unit sphere, and whether it does: (R,), (R,), (R,). A
-    ray that misses it, or has it behind, gets the empty interval where its background starts: at
-    its closest approach, or at near."""
+def sphere_interval(rays: Rays) -> tuple[Tensor, Tensor]:
+    """t (R,) where each ray enters and t (R,) where it leaves the unit sphere. A ray that misses it,
+    or has it behind, gets an empty interval: at its closest approach, or at near."""
     closest = -(rays.o * rays.d).sum(1)  # (R,)
-    disc = closest ** 2 - (rays.o ** 2).sum(1) + 1  # (R,)
-    half = disc.clamp(min=0).sqrt()  # (R,)
-    hit = (disc > 0) & (closest + half > rays.near)  # (R,)
+    half = (closest ** 2 - (rays.o ** 2).sum(1) + 1).clamp(min=0).sqrt()  # (R,)
     t0 = torch.maximum(closest - half, rays.near)  # (R,)
-    return t0, torch.maximum(closest + half, t0), hit
+    return t0, torch.maximum(closest + half, t0)
 
 
 # ---- 3 Octree: features on the corners of cells --------------------------------------------------
@@ -250,7 +247,7 @@ class Octree(nn.Module):
         self.features = nn.Parameter(torch.zeros(PINNED, channels, device=device))  # (V,C)
         self.row_key = torch.arange(-PINNED, 0, device=device)  # (V,) the corner that owns a row
         for name, value in dict(
-                scale=root * 2.0 ** torch.arange(levels), trilinear=TRILINEAR,  # (L,), (8,32)
+                per_unit=1 / self.cell(torch.arange(levels)), trilinear=TRILINEAR,  # (L,), (8,32)
                 bits=torch.tensor([[-1], *[[1]] * (levels - 1)]).int(),  # (L,1) root, then children
                 stride=torch.tensor([(root ** 2, root, 1), *[(4, 2, 1)] * (levels - 1)]).int(),
                 ).items():
@@ -285,7 +282,7 @@ class Octree(nn.Module):
         keys, inverse, count = torch.unique(key[:, None] + self.key(F.pad(octant, (1, 0))),  # (N,8)
                                             return_inverse=True, return_counts=True)
         at = torch.stack([keys // n ** 2, keys // n, keys], 1) % n  # (Q,3) corners
-        last = self.scale[keys // n ** 3, None]  # (Q,1) of their level, on the cube's far faces
+        last = self.root << (keys // n ** 3)[:, None]  # (Q,1) of their level, on the far faces
         free = count == 2 ** ((at > 0) & (at < last)).sum(1)  # (Q,) all cells around it exist
         row = torch.where(free, PINNED - 1 + free.cumsum(0), keys % PINNED)  # (Q,)
         null = torch.arange(PINNED, device=row.device).reshape(8, 8)  # rows of the null block
@@ -304,8 +301,8 @@ class Octree(nn.Module):
     def locate(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Nodes (P,L) that hold x (P,3) on the levels that have cells, 8 + the row in cells or of
         the null block; and where in each, 0..1 (P,L,3). Outside the cube: the nearest inside."""
-        u = (x / (2 * self.half) + 0.5).nan_to_num(0).clamp(0, 1 - 1e-6)  # (P,3)
-        at = u[:, None] * self.scale[:self.active, None]  # (P,L,3) in cells
+        x = x.nan_to_num(0).clamp(-self.half, self.half * (1 - 1e-6))[:, None]  # (P,1,3)
+        at = (x + self.half) * self.per_unit[:self.active, None]  # (P,L,3) in cells
         step = (at.int() & self.bits[:self.active]) * self.stride[:self.active]  # (P,L,3)
         step = step.sum(2, dtype=torch.int32)  # (P,L)
         nodes = [8 + step[:, 0]]  # (P,) root cell, then the child of the cell before
@@ -330,14 +327,15 @@ class Octree(nn.Module):
         return sum(t.numel() * t.element_size() for t in (self.features, self.child, self.corner))
 
 
-def seed_octree(octree: Octree, points: Tensor, dense: int) -> None:
-    """Random features; all cells of the first `dense` levels split, of the next those near points
-    (P,3) and their neighbours, so that no corner around a point is hanging. [D10]"""
+def seed_octree(octree: Octree, points: Tensor, dense: int, near: int = 1) -> None:
+    """Random features; all cells of the first `dense` levels split, of the `near` next those near
+    points (P,3) and their neighbours, so that no corner around a point is hanging. [D10]"""
     for _ in range(dense):
         octree.split(octree.cells)
     step = torch.cartesian_prod(*[torch.arange(-1, 2, device=points.device)] * 3)  # (27,3)
-    home = octree.cells[octree.locate(points)[0][:, -1] - 8]  # (P,4)
-    octree.split(home[:, None] + F.pad(step, (1, 0)))
+    for _ in range(near):
+        home = octree.cells[octree.locate(points)[0][:, -1] - 8]  # (P,4)
+        octree.split(home[:, None] + F.pad(step, (1, 0)))
     octree.features.data[PINNED:].normal_(0, 0.01)
 
 
@@ -408,8 +406,8 @@ class SDFField(nn.Module):
         if with_gradient:
             ds_dz = (torch.sigmoid(BETA * h) * self.lin2.weight[0]) @ self.lin1.weight  # (P,3+LC)
             ds_dx, ds_df = ds_dz.split([3, self.features], 1)  # (P,3), (P,LC)
-            per_unit = self.octree.scale[:, None, None] / (2 * self.octree.half)  # (L,1,1) cells
-            grad = ds_dx + (slope * (ds_df.reshape(value.shape) * per_unit)).sum((1, 3))  # (P,3)
+            ds_df = ds_df.reshape(value.shape) * self.octree.per_unit[:, None, None]  # (P,L,1,C)
+            grad = ds_dx + (slope * ds_df).sum((1, 3))  # (P,3)
         return sdf.flatten(), torch.cat([geo, value.flatten(1)], 1), grad
 
 
@@ -573,7 +571,8 @@ class SDFCache(nn.Module):
         x = rays.at(edges).flip(-1)[None, None]  # (1,1,R,N+1,3) as grid_sample wants it, z first
         s = F.grid_sample(self.volume, x, padding_mode="border", align_corners=True)[0, 0, 0]
         log_phi = F.logsigmoid(zeta.clamp(max=self.volume.shape[-1]) * s)  # (R,N+1)
-        return composite(-torch.expm1(torch.diff(log_phi).clamp(max=0)))[0]  # (R,N)
+        fall = F.pad(torch.diff(log_phi).clamp(max=0), (1, 0))  # (R,N+1) log of what passes
+        return -torch.diff(fall.cumsum(1).exp())  # (R,N)
 
     @torch.no_grad()
     def edges(self, rays: Rays, t0: Tensor, t1: Tensor, jitter: Tensor, zeta: Tensor) -> Tensor:
@@ -590,9 +589,9 @@ class SDFCache(nn.Module):
 def render_rays(model: "GeoNVS", rays: Rays, code: Tensor, jitter: Tensor) -> dict[str, Tensor]:
     """One ray batch through the whole model. code: (R,A) appearance; jitter: (R,S+B) in 0..1, for
     the B background samples too. Returns rgb (R,3), eikonal error of each sample (R,S), and without
-    gradient hit, opacity, depth (R,), normal, the ray's end x (R,3), E_grad of Eq. 4 (R,)."""
+    gradient opacity, depth (R,), normal, the ray's end x (R,3), E_grad of Eq. 4 (R,)."""
     cfg, R, S, zeta = model.cfg, len(rays.o), model.cfg.samples, model.deviation()
-    t0, t1, hit = sphere_interval(rays)  # (R,)
+    t0, t1 = sphere_interval(rays)  # (R,)
     seen_zeta = zeta if cfg.sampling == "cached" else 0 * zeta  # 0: nothing is seen, even sections
     edges = model.cache.edges(rays, t0, t1, jitter[:, :S], seen_zeta)  # (R,S+1)
     t = (edges[:, 1:] + edges[:, :-1]) / 2  # (R,S)
@@ -613,10 +612,10 @@ def render_rays(model: "GeoNVS", rays: Rays, code: Tensor, jitter: Tensor) -> di
     front, passes, behind = 0, torch.ones_like(trans), model.bg_color  # (3,)
     if model.background is not None:
         front, passes, behind = model.background(rays, t0, t1, per_ray, jitter[:, S:])
-    eikonal = ((length - 1) ** 2).reshape(R, S)
+    eikonal = ((length - 1) ** 2).reshape(R, S) * (t1 > t0)[:, None]  # a miss has none
     with torch.no_grad():
         depth = (w * t).sum(1) + trans * t1  # (R,)
-        seen = dict(opacity=1 - trans, depth=depth, x=rays.o + depth[:, None] * rays.d, hit=hit,
+        seen = dict(opacity=1 - trans, depth=depth, x=rays.at(depth[:, None])[:, 0],
                     normal=(w[:, :, None] * normal.reshape(R, S, 3)).sum(1),
                     e_grad=(w * eikonal).sum(1))  # NeuS-weighted [D3]
     rgb = front + passes[:, None] * rgb + trans[:, None] * behind  # (R,3)
@@ -775,17 +774,16 @@ class TransientMask(nn.Module):
 
 # ---- 7 The model and its objective ---------------------------------------------------------------
 
-def random_ball(n: int, gen: torch.Generator) -> Tensor:
-    """Uniform points (n,3) in the unit ball."""
-    direction = F.normalize(torch.randn(n, 3, generator=gen, device=gen.device), dim=1)  # (n,3)
-    return direction * torch.rand(n, 1, generator=gen, device=gen.device) ** (1 / 3)
+def random_cube(n: int, gen: torch.Generator) -> Tensor:
+    """Uniform points (n,3) in the cube around the unit sphere."""
+    return torch.empty(n, 3, device=gen.device).uniform_(-1, 1, generator=gen)
 
 
 def octrees_of(model: nn.Module) -> list[Octree]:
     return [part for part in model.modules() if isinstance(part, Octree)]
 
 
-BG_LEVELS = 3  # octree levels of the background
+BG_LEVELS = 5  # octree levels of the background, the last three only near SfM points
 TERMS = ("rgb", "eik", "curv", "lps", "off", "sfm")  # of Eq. 5; those that hold M: section 6
 
 
@@ -816,7 +814,7 @@ class GeoNVS(nn.Module):
         self.background = None
         if has_field:
             outer = Octree(2.0, BG_LEVELS, device=dev)
-            seed_octree(outer, contract(scene.points[~inside]), 1)
+            seed_octree(outer, contract(scene.points[~inside]), 1, BG_LEVELS - 2)
             self.background = Background(outer, cfg.hidden, 9 + A)
         self.deviation, self.mask = Deviation(), TransientMask(cfg, scene)
         self.cache = SDFCache(int(np.clip(octree.root << levels - 1, 64, 128)))
@@ -847,19 +845,19 @@ class GeoNVS(nn.Module):
             self.cache.refresh(self.distance, step // 8 % 8, 8)
         jitter = torch.rand(R, cfg.samples + cfg.bg_samples, generator=gen, device=gen.device)
         out = render_rays(self, rays, self.appearance(rays.img), jitter)
-        residual, hit = out["rgb"] - rays.rgb, out["hit"]  # (R,3), (R,)
+        residual = out["rgb"] - rays.rgb  # (R,3)
         error = residual.abs().mean(1)  # (R,) L1
         is_on = self.mask.is_on
         mask = mask_at(self.mask.logits[pick], rays.uv) if is_on else torch.zeros_like(error)
         kept = (1 - mask) * error  # (R,) what the mask leaves of it
         some = torch.randint(max(len(self.sfm), 1), (n,), generator=gen, device=gen.device)
         sfm = self.sfm[some] if len(self.sfm) else self.sfm  # (n,3) or (0,3)
-        x = torch.cat([taps(out["x"], self.eps).reshape(-1, 3), random_ball(n, gen), sfm])
+        x = torch.cat([taps(out["x"], self.eps).reshape(-1, 3), random_cube(n, gen), sfm])
         ends, off, sfm = self.distance(x).split([5 * R, n, len(sfm)])  # all points but the samples
         lap = finite_differences(ends.reshape(R, 5), self.eps)[1]  # (R,) where rays end
         e_curv = lap.abs() * self.eps * out["opacity"]  # (R,) flat, not transparent [D13]
         terms = dict(rgb=kept.mean(),
-                     eik=(out["eikonal"].mean(1) * hit).sum() / hit.sum().clamp(min=1),
+                     eik=out["eikonal"].mean(),
                      curv=e_curv.mean(),  # [D4]
                      lps=torch.log(self.color.bounds()).sum(),  # [D5]
                      off=torch.exp(-50 * off.abs()).mean(),
@@ -900,7 +898,7 @@ class GeoNVS(nn.Module):
         groups = dict(params=[grid], lr=1e-3), dict(params=nets, lr=5e-3)
         adam = torch.optim.Adam(groups, fused=True)
         for _ in range(steps):
-            x = random_ball(1024, gen)  # (P,3)
+            x = random_cube(1024, gen)  # (P,3)
             loss = ((self.distance(x) - (x.norm(dim=1) - radius)) ** 2).mean()
             adam.zero_grad()
             loss.backward()
@@ -915,7 +913,8 @@ class GeoNVS(nn.Module):
         if cfg.grid == "octree":
             keys = refined_keys(octree, self.distance, self.hits, zeta, cfg.max_mb)
         if is_last and mask == "auto":
-            share = self.mask.logits[~self.scene.is_test].sigmoid().mean().item()
+            logits = self.mask.logits[self.mask.logits != -9]  # of photos that it has seen
+            share = logits.sigmoid().mean().item()
             mask = "on" if share > 0.01 else "off"
             print(f"  mean mask {share:.4f}: mask {mask}")
         return dict(keys=keys.cpu(), mask=mask)
@@ -942,48 +941,41 @@ class GeoNVS(nn.Module):
 
 # ---- 8 Energy ------------------------------------------------------------------------------------
 
+def open_counter(device: torch.device, rapl: str = "/sys/class/powercap"):
+    """A function that reads joules: of a GPU through NVML (Volta and newer), whatever
+    CUDA_VISIBLE_DEVICES says, or of a CPU's packages, where readable (often by root only)."""
+    if device.type == "cuda":
+        import pynvml
+        pynvml.nvmlInit()
+        uuid = torch.cuda.get_device_properties(device).uuid
+        gpu = pynvml.nvmlDeviceGetHandleByUUID(f"GPU-{uuid}")
+        return lambda: pynvml.nvmlDeviceGetTotalEnergyConsumption(gpu) / 1e3  # mJ
+    if LOCAL_RANK:  # one process reads for a machine
+        return float
+    packages = [p for p in Path(rapl).glob("intel-rapl:*") if p.name.count(":") == 1]
+    need(packages, f"no counter in {rapl}")
+    return lambda: sum(int((p / "energy_uj").read_text()) for p in packages) / 1e6
+
+
 class EnergyMeter:
-    """Joules that counter() has counted from tick to tick; None, never 0, if nothing counts. A
-    counter that starts again from zero between two ticks loses what it counted there."""
-    def __init__(self, source=None, counter=None):
-        self.source, self.counter, self.last = source, counter, None
-        self.joules = 0.0 if counter else None
+    """Joules counted from tick to tick; None, never 0, from where on nothing counts. A counter that
+    starts again from zero between two ticks loses what it counted there."""
+    def __init__(self, device: torch.device, counter=None):
+        self.device, self.counter, self.joules, self.last = device, counter, 0.0, None
+        self.source = f"{'nvml' if device.type == 'cuda' else 'rapl'} counter, read every 5 s"
 
     def tick(self) -> None:
         """Adds what was spent since the last tick. A failing reading ends metering, not the run."""
         if self.joules is None:
             return
         try:
+            self.counter = self.counter or open_counter(self.device)
             now = self.counter()
             self.joules += max(0.0, now - (now if self.last is None else self.last))
             self.last = now
-        except Exception as error:  # drivers raise what they like
-            print(f"  energy is null, as it could not be read any more ({error})")
+        except Exception as error:  # a package, a driver's answer or a permission is missing
+            print(f"  energy is null ({error}); a GPU's needs: pip install nvidia-ml-py")
             self.source = self.joules = None
-
-
-def make_meter(device: torch.device, rapl: str = "/sys/class/powercap") -> EnergyMeter:
-    """A GPU's counter through NVML (Volta and newer), whatever CUDA_VISIBLE_DEVICES says; for a CPU
-    that of its packages, where readable (often by root only); or none, and a line that says why."""
-    try:
-        if device.type == "cuda":
-            import pynvml
-            pynvml.nvmlInit()
-            uuid = torch.cuda.get_device_properties(device).uuid
-            gpu = pynvml.nvmlDeviceGetHandleByUUID(f"GPU-{uuid}")
-            read = lambda: pynvml.nvmlDeviceGetTotalEnergyConsumption(gpu) / 1e3  # mJ
-        elif LOCAL_RANK:  # one process reads for a machine
-            read = float
-        else:
-            packages = [p for p in Path(rapl).glob("intel-rapl:*") if p.name.count(":") == 1]
-            need(packages, f"no counter in {rapl}")
-            read = lambda: sum(int((p / "energy_uj").read_text()) for p in packages) / 1e6
-        read()
-        source = "nvml" if device.type == "cuda" else "rapl"
-        return EnergyMeter(f"{source} counter, read every 5 s", read)
-    except Exception as error:  # a package, a driver's answer or a permission is missing
-        print(f"  energy is null ({error}); a GPU's needs: pip install nvidia-ml-py")
-        return EnergyMeter()
 
 
 # ---- 9 Training ----------------------------------------------------------------------------------
@@ -1078,7 +1070,7 @@ def train(cfg: Config, scene: Scene, run: Path, saved: dict | None = None, kind=
     torch.set_flush_denormal(True)  # vanishing weights would otherwise slow a CPU down
     torch.manual_seed(cfg.seed)
     gen = torch.Generator(scene.c2w.device).manual_seed(cfg.seed)
-    model, meter, terms = kind(cfg, scene), make_meter(scene.c2w.device), {}
+    model, meter, terms = kind(cfg, scene), EnergyMeter(scene.c2w.device), {}
     state = dict(step=0, refined=0, seconds=0.0, dropped=0, joules=0.0)
     meter.tick()
     if saved is None:  # nothing of a former run may be taken for this one's
@@ -1179,13 +1171,6 @@ def make_lpips(device):
     return lambda *pair: net(*map(as_batch, pair), normalize=True).item()  # 0..1 to -1..1
 
 
-def half_pixels(scene: Scene, photo: int, left: bool) -> Tensor:
-    """Pixel numbers of the columns left of w // 2, or from there on. [D12]"""
-    w, h = scene.wh[photo].tolist()
-    pixel = torch.arange(w * h, device=scene.c2w.device)
-    return pixel[(pixel % w < w // 2) == left]
-
-
 def fit_codes(model, scene: Scene, photos: Tensor, steps: int = 128, n: int = 0) -> Tensor:
     """Appearance codes (B,A) of unseen photos (B,): Adam on n random rays a step of each left half
     (64, on a GPU 512) [D12], from the mean code of the training photos. The scene stays as is."""
@@ -1194,13 +1179,15 @@ def fit_codes(model, scene: Scene, photos: Tensor, steps: int = 128, n: int = 0)
     codes = codes.detach().clone().requires_grad_()
     if codes.numel() == 0:
         return codes
-    left = [half_pixels(scene, i, True) for i in photos.tolist()]
+    img = photos.repeat_interleave(n)  # (Bn,)
+    size = torch.stack([scene.wh[img, 0] // 2, scene.wh[img, 1]], 1)  # (Bn,2) of the left halves
     adam = torch.optim.Adam([codes], lr=0.1)
     model.requires_grad_(False)
     for step in tell(range(steps), "fitting the light of held-out photos"):
         adam.param_groups[0]["lr"] = 0.1 * 0.1 ** (step / steps)
-        pixel = [a[torch.randint(len(a), (n,), generator=gen, device=gen.device)] for a in left]
-        rays = make_rays(scene, photos.repeat_interleave(n), torch.cat(pixel))
+        u = torch.rand(size.shape, generator=gen, device=gen.device, dtype=torch.float64)
+        col, row = (u * size).long().unbind(1)  # (Bn,)
+        rays = make_rays(scene, img, row * scene.wh[img, 0] + col)
         loss = (model.render(rays, codes.repeat_interleave(n, 0))["rgb"] - rays.rgb).abs().mean()
         adam.zero_grad()
         loss.backward()
@@ -1265,17 +1252,14 @@ def toy_truth(model, scene: Scene) -> dict:
     true = data_prep.toy_sdf(x.cpu().numpy() * raw["scale"] + raw["center"],
                              info["background"], info["landmark"]) / raw["scale"]  # (P,)
     s = torch.cat([model.distance(part) for part in x.split(CHUNK)]).cpu().numpy()  # (P,)
-    scores = dict(sdf_error=float(np.abs(s - true)[np.abs(true) < 0.05].mean()),
-                  mask_iou=None, mask_static=None)
-    if model.mask.is_on:
-        mask = torch.cat([mask_at(model.mask.look(i), rays.uv[rays.img == i])
-                          for i in scene.photos(False)[:, None]]).cpu().numpy()  # (R,)
-        occluder = raw["occluder"][pixel.cpu()]  # (R,)
-        union = ((mask > 0.5) | occluder).sum()
-        scores["mask_static"] = float(mask[~occluder].mean())
-        if occluder.any():
-            scores["mask_iou"] = float(((mask > 0.5) & occluder).sum() / union)
-    return scores
+    error = float(np.abs(s - true)[np.abs(true) < 0.05].mean())
+    if not model.mask.is_on:
+        return dict(sdf_error=error, mask_iou=None, mask_static=None)
+    mask = torch.cat([mask_at(model.mask.look(i), rays.uv[rays.img == i])
+                      for i in scene.photos(False)[:, None]]).cpu().numpy()  # (R,)
+    people, found = raw["occluder"][pixel.cpu()], mask > 0.5  # (R,)
+    iou = float((found & people).sum() / (found | people).sum()) if people.any() else None
+    return dict(sdf_error=error, mask_iou=iou, mask_static=float(mask[~people].mean()))
 
 
 @torch.no_grad()
@@ -1374,13 +1358,13 @@ def film(model, scene: Scene, path: Path, rays: float = 4e6) -> None:
     photos = scene.photos(False)
     c2w, codes = scene.c2w[photos], model.codes()[photos]
     between = lambda keys: F.interpolate(keys.T[None], 48, mode="linear", align_corners=True)[0].T
-    centre = c2w[:, :, 3] - c2w[:, :, 3].mean(0)  # (B,3)
-    order = (centre @ torch.linalg.svd(centre)[2][0]).argsort()  # along the axis of their spread
+    place = c2w[:, :, 3] - c2w[:, :, 3].mean(0)  # (B,3)
+    order = (place @ torch.linalg.svd(place)[2][0]).argsort()  # along the axis of their spread
     stops = order[torch.linspace(0, len(order) - 1, min(7, len(order))).round().long()]
     poses = between(c2w[stops].flatten(1)).reshape(-1, 3, 4)  # (48,3,4)
     left, _, right = torch.linalg.svd(poses[:, :, :3])
     poses[:, :, :3] = left @ right  # the nearest rotation
-    view = centre.norm(dim=1).argmin()  # the middle camera
+    view = order[len(order) // 2]  # the middle camera
     shots = [(pose, codes.mean(0)) for pose in poses]
     shots += [(c2w[view], code) for code in between(codes)] if codes.numel() else []
     wh, K, near = (a[photos[view]][None] for a in (scene.wh, scene.K, scene.near))
