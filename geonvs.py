@@ -37,8 +37,7 @@ Where the printed paper is departed from, the line carries its tag:
 """
 from __future__ import annotations
 
-import argparse, datetime, functools, io, json, math, os, resource, shutil, signal
-import subprocess, sys, threading, time
+import argparse, datetime, functools, io, json, math, os, resource, shutil, subprocess, sys, time
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import NamedTuple
@@ -191,8 +190,8 @@ def random_rays(scene: Scene, photos: Tensor, n: int, per_step: int, gen: torch.
 
 
 def sphere_interval(rays: Rays) -> tuple[Tensor, Tensor]:
-    """t (R,) where each ray enters and t (R,) where it leaves the unit sphere. A ray that misses it,
-    or has it behind, gets an empty interval: at its closest approach, or at near."""
+    """Distances (R,), (R,) at which rays enter and leave the unit sphere. A ray that misses it, or
+    has it behind, gets an empty interval: at its closest approach, or at near."""
     closest = -(rays.o * rays.d).sum(1)  # (R,)
     half = (closest ** 2 - (rays.o ** 2).sum(1) + 1).clamp(min=0).sqrt()  # (R,)
     t0 = torch.maximum(closest - half, rays.near)  # (R,)
@@ -1087,13 +1086,12 @@ def train(cfg: Config, scene: Scene, run: Path, saved: dict | None = None, kind=
     photos, begin, spent = scene.photos(False), begin - state["seconds"], state["joules"]
     next_line, next_save = state["seconds"] + 5, state["seconds"] + 60
     dropped = torch.tensor(state["dropped"], device=photos.device)
-    streak, stop = torch.zeros_like(dropped), threading.Event()  # void steps in a row
-    handler = signal.signal(signal.SIGINT, lambda *_: stop.set())  # Ctrl-C lets a step end
+    streak = torch.zeros_like(dropped)  # void steps in a row
     while True:
-        seconds, is_stopped = agreed((time.perf_counter() - begin, stop.is_set()))
+        seconds = agreed(time.perf_counter() - begin)
         progress = seconds / (60 * cfg.minutes) if cfg.minutes else state["step"] / cfg.steps
         has_diverged = state["step"] % PATIENCE == 0 and int(streak) >= PATIENCE
-        is_over = progress >= 1 or is_stopped or has_diverged
+        is_over = progress >= 1 or has_diverged
         if is_over or seconds > next_line:
             state["dropped"] = int(dropped)  # waits for a GPU's queue
             meter.tick()
@@ -1104,10 +1102,8 @@ def train(cfg: Config, scene: Scene, run: Path, saved: dict | None = None, kind=
             RANK or report(model, run / "log.jsonl", progress, state, terms)
             next_line = seconds + 5
             if is_over or seconds > next_save:
-                saving = time.perf_counter()
                 RANK or save_checkpoint(path, model, optimizer, gen, state)
-                took = time.perf_counter() - saving
-                next_save = seconds + max(60, 50 * took)  # a large one less often: 2 % of the time
+                next_save = seconds + 60
         if is_over:
             break
         terms, is_void = training_step(model, optimizer, photos, state, progress, gen)
@@ -1115,8 +1111,6 @@ def train(cfg: Config, scene: Scene, run: Path, saved: dict | None = None, kind=
         if state["refined"] < len(REFINE_AT) and progress >= REFINE_AT[state["refined"]]:
             state["refined"] += 1
             model.follow(agreed(model.plan(state["refined"] == len(REFINE_AT))), optimizer)
-    signal.signal(signal.SIGINT, handler)
-    need(not is_stopped, f"stopped at step {state['step']}; add --resume to go on")
     need(not has_diverged, f"the last {int(streak)} steps had no finite loss or gradient; likely: "
          "learning rates too high (try a third of --lr_grid and --lr_net) or broken poses; "
          f"{path} holds the last good weights")
@@ -1328,7 +1322,7 @@ def finish(model, scene: Scene, state: dict, run: Path) -> dict:
                render_photo(model, scene, i, model.codes()[i])) for i in busy[:2].tolist()]
     picture = panel(model, frames + scores.pop("frames"))[:, :, ::-1]
     atomic_write(run / "panel.png", lambda tmp: cv2.imwrite(str(tmp), picture))
-    git = ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short", "HEAD"]
+    git = ["git", "-C", Path(__file__).parent, "rev-parse", "--short", "HEAD"]
     metrics = dict(
         scene=scene.info["scene"], method=model.name, seed=cfg.seed, steps=state["step"],
         device=(torch.cuda.get_device_name() if is_gpu else
@@ -1338,7 +1332,6 @@ def finish(model, scene: Scene, state: dict, run: Path) -> dict:
         rays_per_second=state["step"] * cfg.rays / max(state["seconds"], 1e-9),
         parameters=sum(p.numel() for p in model.parameters()),
         octree_cells=octrees and octrees[0].cells[:, 0].bincount().tolist() or None,
-        octree_bytes=octrees[0].bytes() if octrees else None,
         model_bytes=sum(p.numel() * 4 for p in model.parameters()) + sum(
             o.bytes() - 4 * o.features.numel() for o in octrees),
         peak_memory_bytes=peak, torch=torch.__version__, config=asdict(cfg),
@@ -1485,8 +1478,8 @@ def run_command_line(entry) -> None:
         message = "the GPU's memory is full: lower --samples or --max_mb, or --rays in a new run"
     except OSError as error:  # a full disk, a folder without permission
         message = f"{error}: free or choose a place, then go on with --resume"
-    except KeyboardInterrupt:  # outside the training loop, which ends its step and saves
-        message = "stopped; the last checkpoint stays, --resume goes on from it"
+    except KeyboardInterrupt:
+        message = "stopped; --resume goes on from the last checkpoint, there is one every minute"
     print(f"error: {message}", file=sys.stderr)
     sys.exit(2)
 

@@ -5,7 +5,7 @@ The tests come from properties: naive loops in float64, closed forms, limits, in
 needs data, network or a GPU, nothing is skipped, and no timing decides.
 """
 import ast, contextlib, copy, dataclasses, functools, http.server, inspect, io, itertools, json, math, os, pickle, re
-import resource, shutil, signal, socket, struct, subprocess, sys, tarfile, threading, time, tracemalloc, types, zipfile
+import resource, shutil, socket, struct, subprocess, sys, tarfile, threading, time, tracemalloc, types, zipfile
 from dataclasses import asdict, fields
 from pathlib import Path
 from types import SimpleNamespace
@@ -2033,15 +2033,6 @@ def test_a_run_killed_at_any_moment_goes_on_bit_for_bit(arrays, scene, tmp_path,
     assert same_weights(*[model for model, _ in runs]) and log_of(tmp_path)[-1] == log_of(tmp_path / "whole")[-1]
 
 
-def test_ctrl_c_ends_the_step_saves_and_says_how_to_go_on(scene, tmp_path, quick, monkeypatch, six):
-    handler = signal.getsignal(signal.SIGINT)
-    with monkeypatch.context() as patch, pytest.raises(UserError, match="step 3.*--resume"):
-        before_step(patch, lambda state: state["step"] == 2 and signal.raise_signal(signal.SIGINT))
-        run_training(scene, tmp_path)
-    assert checkpoint(tmp_path)["state"]["step"] == 3 and signal.getsignal(signal.SIGINT) is handler
-    assert same_weights(six.model, run_training(scene, tmp_path, checkpoint(tmp_path))[0])
-
-
 def spoil(patch, is_bad, how=lambda total, model: total * math.nan):
     losses = g.GeoNVS.losses
 
@@ -2211,13 +2202,12 @@ def together():
                             EnergyMeter=functools.partial(g.EnergyMeter, counter=spent.__next__)).items():
             patch.setattr(g, name, f)
         g.main(["--name=a", "--device=cpu", "--lr_grid=0.05", "--lr_net=0.01", *FLAGS, "--steps=40"])
-        before_step(patch, lambda state: (g.RANK, state["step"]) == (0, 2) and signal.raise_signal(signal.SIGINT))
-        with pytest.raises(UserError, match="stopped at step 3"):
-            run_training(g.load_scene(dict(np.load("scene.npz"))), Path("runs/b"), steps=40)
+        patch.setattr(g, "train", train)
+        run_training(g.load_scene(dict(np.load("scene.npz"))), Path("runs/b"), steps=3)
 
 
 def test_two_processes_train_one_model_on_the_rays_of_both(arrays, tmp_path, monkeypatch):
-    """A step that is void on the second, and Ctrl-C on the first, are so for both; the first speaks and writes."""
+    """A step that is void on the second is so for both; the first speaks and writes."""
     for name in ("alone", "pair"):
         (tmp_path / name).mkdir()
         np.savez(tmp_path / name / "scene.npz", **arrays)
@@ -2791,7 +2781,7 @@ STRESS = {  # knobs of the toy, and the piece that is made for them
     "few photos": (dict(photos=8), "no SfM term"), "wrong poses": (dict(photos=24, pose_noise=3.0), "no curvature"),
     "other building": (dict(photos=24, landmark=3), "no curvature")}
 FIGURES = ("psnr", "psnr_floor", "ssim", "sdf_error", "mask_iou", "mask_static", "steps", "train_seconds",
-           "energy_wh", "rays_per_second", "octree_bytes", "parameters")
+           "energy_wh", "rays_per_second", "model_bytes", "parameters")
 
 
 def rows_of(name, given, published):
@@ -2854,25 +2844,30 @@ def time_to(lines, level, unit):
 
 
 def draw(name, table, plt):
-    """The figure of an experiment, from its table alone: PSNR over what it cost, or row by row."""
+    """The figure of an experiment, from its table alone: PSNR over what it cost, or what each row gains over the
+    first row, the best one last; in `stress` over the trivial predictor."""
     rows = [r for r in table if r["psnr"]]
-    axes = dict(train_seconds="training, s", energy_wh="energy, Wh") if name == "chart" else dict(row="PSNR, dB; failed runs")
+    if name != "chart":
+        rows = rows if name == "stress" else sorted(rows, key=lambda r: r["psnr"])
+        gains = [r["psnr"] - (r["psnr_floor"] if name == "stress" else table[0]["psnr"]) for r in rows]
+        figure, axis = plt.subplots(figsize=(6.5, 1 + 0.25 * len(rows)))
+        axis.barh(range(len(rows)), gains, xerr=[r["psnr_std"] for r in rows], capsize=3,
+                  color=["tab:orange" if gain < 0 else "tab:blue" for gain in gains])
+        failed = [f" ({r['failures']} of {r['runs']} failed)" if r["failures"] else "" for r in rows]
+        axis.set_yticks(range(len(rows)), [r["row"] + text for r, text in zip(rows, failed)])
+        over = "the trivial predictor" if name == "stress" else f"'{table[0]['row']}', {table[0]['psnr']:.2f} dB"
+        axis.set(xlabel=f"PSNR over {over}, dB", ylim=(len(rows), -1))
+        return figure
+    axes = dict(train_seconds="training, s", energy_wh="energy, Wh")
     axes = {unit: text for unit, text in axes.items() if any(r[unit] for r in rows)}
-    figure, panels = plt.subplots(1, len(axes), figsize=(6.5 * len(axes), max(4, 0.25 * len(rows))), squeeze=False)
+    figure, panels = plt.subplots(1, len(axes), figsize=(6.5 * len(axes), 4), squeeze=False)
     for axis, (unit, text) in zip(panels[0], axes.items()):
-        if unit == "row":
-            places = range(len(rows))
-            axis.errorbar([r["psnr"] for r in rows], places, xerr=[r["psnr_std"] for r in rows], fmt="o", capsize=3)
-            axis.plot([r["psnr_floor"] for r in rows], places, "|", color="grey", label="trivial predictor")
-            axis.set_yticks(places, [f"{r['row']}; {r['failures']}/{r['runs']}" for r in rows])
-            axis.set(xlabel=text, ylim=(len(rows), -1))
-        else:
-            for kind in dict.fromkeys(r["row"].split(" x")[0] for r in rows):
-                mine = [r for r in rows if r["row"].split(" x")[0] == kind and r[unit]]
-                axis.errorbar(*([r[k] for r in mine] for k in (unit, "psnr", "psnr_std")), marker="o", capsize=3, label=kind)
-            axis.axhline(np.mean([r["psnr_floor"] for r in rows]), color="grey", label="trivial predictor")
-            axis.set(xscale="log", xlabel=text, ylabel="PSNR of held-out right halves, dB")
-            axis.xaxis.set_major_formatter("{x:g}")
+        for kind in dict.fromkeys(r["row"].split(" x")[0] for r in rows):
+            mine = [r for r in rows if r["row"].split(" x")[0] == kind and r[unit]]
+            axis.errorbar(*([r[k] for r in mine] for k in (unit, "psnr", "psnr_std")), marker="o", capsize=3, label=kind)
+        axis.axhline(np.mean([r["psnr_floor"] for r in rows]), color="grey", label="trivial predictor")
+        axis.set(xscale="log", xlabel=text, ylabel="PSNR of held-out right halves, dB")
+        axis.xaxis.set_major_formatter("{x:g}")
         axis.legend()
     return figure
 
