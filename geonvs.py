@@ -28,15 +28,13 @@ Where the printed paper is departed from, the line carries its tag:
   [D6]  CGNet: GroupNorm, ReLU, half the width, negative first bias, head at half resolution
   [D7]  the mask pays mean M, not mean M^2, to go with an L1 error, above what SfM pixels err by
   [D8]  the background also fills what lies before the sphere; its last section is opaque
-  [D9]  colours and background run in half precision; it would make noise of distances and normals
+  [D9]  all is float32: mixed precision, as the paper has it, makes noise of distances and normals
   [D10] SfM points place the sphere, seed the octree, pull |s(p)| to zero and teach M = 0
   [D11] samples are drawn from a cached SDF volume; no second network pass along the ray
   [D12] test photos: appearance fitted on the left half, scored on the right half
   [D13] exact normals by trilinear weights (--normals fd: as printed); curvature where a ray ends
   [D14] the mask learns every few steps, by a logistic surrogate, from averaged errors of photos
 """
-from __future__ import annotations
-
 import argparse, datetime, functools, io, json, math, os, resource, shutil, subprocess, sys, time
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
@@ -72,7 +70,7 @@ class Config:
     name: str = opt("", "run folder below runs/ (default: scene-method-seed)")
     seed: int = opt(0, "seed of everything random")
     device: str = opt("auto", "auto, cpu, cuda or cuda:N")
-    steps: int = opt(4000, "training steps")
+    steps: int = opt(3000, "training steps")
     minutes: float = opt(0.0, "training budget in minutes, instead of --steps if above 0")
     downscale: int = opt(2, "integer factor by which photos are made smaller (benchmarks use 2)")
     rays: int = opt(512, "rays per step, of all processes together")
@@ -104,10 +102,18 @@ class Config:
     lr_net: float = opt(2e-3, "learning rate of networks")
     lr_zeta: float = opt(1e-3, "learning rate of the deviation network")
 
+    def __post_init__(self):  # refuses what cannot work, before anything is written
+        least = dict(samples=2, bg_samples=2, rays=2, photos=1, steps=1, downscale=1, hidden=1)
+        for f in fields(self):
+            value, low = getattr(self, f.name), least.get(f.name, 0)
+            is_right = isinstance(value, str) if f.type is str else low <= value < 2 ** 63
+            need(is_right and value in (f.metadata["choices"] or [value]),
+                 f"--{f.name} {value} makes no sense: use a number from {low}, or see --help")
+        need(self.levels <= 9, "--levels goes up to 9: 4096 cells a side")
 
+
+# settings of photos on a GPU that differ from Config's defaults; flags override them
 LARGE = dict(steps=300_000, rays=4096, photos=16, samples=32, appearance_dim=32)
-# settings that differ from Config's defaults, by scene; flags override them
-SCENES = {"toy": dict(steps=3000), **{name: LARGE for name in data_prep.SCENES}}
 
 
 # ---- 2 Scene file and rays -----------------------------------------------------------------------
@@ -124,8 +130,7 @@ class Scene(NamedTuple):
     is_test: Tensor  # (I,)
     points: Tensor  # (K,3) SfM points
     track_photo: Tensor  # (T,) a photo that shows
-    track_point: Tensor  # (T,) a point
-    track_uv: Tensor  # (T,2) at a place, over photo size, 0..1
+    track_uv: Tensor  # (T,2) an SfM point at a place, over photo size, 0..1
     thumbs: Tensor  # (I,3,n,n) uint8, whole photos for the mask network
     raw: dict  # the file in numpy: names, statistics, center, scale, ground truth of the toy
     info: dict
@@ -142,9 +147,8 @@ def load_scene(raw: dict, device="cpu") -> Scene:
     side = int(np.clip(np.median(raw["wh"].max(1)) / 2, 96, 256))  # px that the mask network sees
     thumbs = [cv2.resize(p, (side, side), interpolation=cv2.INTER_AREA) for p in photos]
     thumbs = torch.as_tensor(np.stack(thumbs)).permute(0, 3, 1, 2).contiguous().to(device)
-    kinds = dict.fromkeys(("start", "wh", "track_photo", "track_point"), torch.long)
-    kinds |= dict(is_test=torch.bool, rgb=torch.uint8)
-    arrays = {k: torch.as_tensor(raw[k]).to(device, kinds.get(k, torch.float32))
+    kinds = dict(i=torch.long, f=torch.float32)  # uint8 and bool stay what they are
+    arrays = {k: torch.as_tensor(raw[k], dtype=kinds.get(raw[k].dtype.kind), device=device)
               for k in Scene._fields[:-3]}
     return Scene(**arrays, thumbs=thumbs, raw=raw, info=json.loads(str(raw["info"])))
 
@@ -164,29 +168,14 @@ class Rays(NamedTuple):
         return torch.addcmul(self.o[:, None], t[:, :, None], self.d[:, None])
 
 
-def pixel_directions(uv_px: Tensor, K: Tensor) -> Tensor:
-    """Unit directions in camera axes of positions uv_px (R,2) px, pixel centres at +0.5."""
-    xy = (uv_px - K[:, 2:]) / K[:, :2]  # (R,2)
-    return F.normalize(F.pad(xy, (0, 1), value=1.0), dim=1)  # (R,3)
-
-
 def make_rays(scene: Scene, img: Tensor, pixel: Tensor) -> Rays:
     """Rays through pixels. img, pixel: (R,) photo and row-major pixel number within it."""
-    wh = scene.wh[img]  # (R,2)
+    wh, K, c2w = scene.wh[img], scene.K[img], scene.c2w[img]  # (R,2), (R,4), (R,3,4)
     uv = torch.stack([pixel % wh[:, 0], pixel // wh[:, 0]], 1) + 0.5  # (R,2) px
-    c2w = scene.c2w[img]  # (R,3,4)
-    d = (c2w[:, :, :3] @ pixel_directions(uv, scene.K[img])[:, :, None])[:, :, 0]  # (R,3)
+    d = F.pad((uv - K[:, 2:]) / K[:, :2], (0, 1), value=1.0)  # (R,3) in camera axes
+    d = (c2w[:, :, :3] @ F.normalize(d, dim=1)[:, :, None])[:, :, 0]  # (R,3)
     rgb = scene.rgb[scene.start[img] + pixel].float() / 255  # (R,3)
     return Rays(c2w[:, :, 3], d, scene.near[img], img, uv / wh, rgb)
-
-
-def random_rays(scene: Scene, photos: Tensor, n: int, per_step: int, gen: torch.Generator):
-    """n training rays from per_step random photos. Returns Rays and the photos (B,) drawn."""
-    dev = photos.device
-    pick = photos[torch.randint(len(photos), (per_step,), generator=gen, device=dev)]  # (B,)
-    img = pick.repeat_interleave(n // per_step)  # (R,) photo by photo, equally many from each
-    u = torch.rand(len(img), generator=gen, device=dev, dtype=torch.float64)  # (R,)
-    return make_rays(scene, img, (u * scene.wh[img].prod(1)).long()), pick
 
 
 def sphere_interval(rays: Rays) -> tuple[Tensor, Tensor]:
@@ -200,7 +189,6 @@ def sphere_interval(rays: Rays) -> tuple[Tensor, Tensor]:
 
 # ---- 3 Octree: features on the corners of cells --------------------------------------------------
 
-CORNERS = torch.cartesian_prod(*[torch.arange(2)] * 3)  # (8,3), x slowest
 # (8,32): the monomials 1 z y yz x xz xy xyz of a position in a cell times this are the weights of
 # the 8 corners, then their derivatives along x, y, z. Per axis the ends weigh 1 - f and f.
 VALUE, SLOPE = torch.tensor([[[1.0, 0], [-1, 1]], [[-1, 1], [0, 0]]])  # (2,2) each, rows 1, f
@@ -245,12 +233,11 @@ class Octree(nn.Module):
         self.half, self.levels, self.root = half, levels, root
         self.features = nn.Parameter(torch.zeros(PINNED, channels, device=device))  # (V,C)
         self.row_key = torch.arange(-PINNED, 0, device=device)  # (V,) the corner that owns a row
-        for name, value in dict(
-                per_unit=1 / self.cell(torch.arange(levels)), trilinear=TRILINEAR,  # (L,), (8,32)
-                bits=torch.tensor([[-1], *[[1]] * (levels - 1)]).int(),  # (L,1) root, then children
-                stride=torch.tensor([(root ** 2, root, 1), *[(4, 2, 1)] * (levels - 1)]).int(),
-                ).items():
-            self.register_buffer(name, value.to(device), persistent=False)
+        constant = lambda value: nn.Buffer(value.to(device), persistent=False)
+        self.per_unit = constant(1 / self.cell(torch.arange(levels)))  # (L,)
+        self.trilinear = constant(TRILINEAR)  # (8,32)
+        steps = torch.tensor([[-1, root ** 2, root, 1], *[[1, 4, 2, 1]] * (levels - 1)]).int()
+        self.bits, self.stride = constant(steps[:, :1]), constant(steps[:, 1:])  # (L,1), (L,3)
         self.build(self.row_key[:0])
 
     def cell(self, level):
@@ -265,19 +252,18 @@ class Octree(nn.Module):
     def build(self, split_keys: Tensor) -> Tensor:
         """Makes nodes and corners from the keys of the cells that are split. New features are zero.
         Returns the former row (V,) of every row, 0 (a pinned one) if new."""
-        octant = CORNERS.to(split_keys.device)  # (8,3)
+        octant = torch.cartesian_prod(*[torch.arange(2, device=split_keys.device)] * 3)  # (8,3)
         ijk = torch.cartesian_prod(*[torch.arange(self.root, device=octant.device)] * 3)  # (N,3)
-        cells, child, n_nodes = [], [octant.new_zeros(8)], 8
+        cells, cut = [], []
         for level in range(self.levels):
             cells.append(F.pad(ijk, (1, 0), value=level))  # (N,4)
-            is_split = torch.isin(self.key(cells[-1]), split_keys) & (level + 1 < self.levels)
-            n_nodes += len(ijk)
-            child.append(torch.where(is_split, n_nodes + 8 * (is_split.cumsum(0) - 1), 0))  # (N,)
-            ijk = (2 * ijk[is_split][:, None] + octant).reshape(-1, 3)  # (N,3) of the next level
-        self.cells, self.child = torch.cat(cells), torch.cat(child).int()  # (N,4), (8+N,)
+            cut.append(torch.isin(self.key(cells[-1]), split_keys) & (level + 1 < self.levels))
+            ijk = (2 * ijk[cut[-1]][:, None] + octant).reshape(-1, 3)  # (N,3) of the next level
+        self.cells, cut = torch.cat(cells), torch.cat(cut)  # (N,4), (N,) is it split
+        self.child = F.pad(torch.where(cut, 8 * cut.cumsum(0) + self.root ** 3, 0), (8, 0)).int()
         self.active = int(self.cells[-1, 0]) + 1  # levels that have cells
         key, n = self.key(self.cells), (self.root << self.levels) + 1  # (N,)
-        self.split_keys = key[self.child[8:] > 0]
+        self.split_keys = key[cut]
         keys, inverse, count = torch.unique(key[:, None] + self.key(F.pad(octant, (1, 0))),  # (N,8)
                                             return_inverse=True, return_counts=True)
         at = torch.stack([keys // n ** 2, keys // n, keys], 1) % n  # (Q,3) corners
@@ -320,10 +306,6 @@ class Octree(nn.Module):
         corner = self.corner.index_select(0, nodes.flatten())  # (PL,8)
         out = Interpolate.apply(self.features, corner, w).reshape(P, L, J, self.features.shape[1])
         return F.pad(out, (0, 0, 0, 0, 0, self.levels - L)) if L < self.levels else out
-
-    def bytes(self) -> int:
-        """Memory of features and of the structure that a query needs."""
-        return sum(t.numel() * t.element_size() for t in (self.features, self.child, self.corner))
 
 
 def seed_octree(octree: Octree, points: Tensor, dense: int, near: int = 1) -> None:
@@ -431,12 +413,6 @@ def direction_basis(d: Tensor) -> Tensor:
     return torch.cat([d, d * d, d * d.roll(1, 1)], 1)
 
 
-def half_precision(x: Tensor):
-    """bfloat16 for colours and background, on GPUs that have it. [D9]"""
-    has_it = x.is_cuda and torch.cuda.get_device_capability(x.device) >= (8, 0)
-    return torch.autocast(x.device.type, torch.bfloat16, enabled=has_it)
-
-
 class LipschitzMLP(nn.Module):
     """MLP whose rows are scaled to an L1 norm of at most softplus(c) (Liu et al. 2022)."""
     def __init__(self, sizes: list[int]):
@@ -454,10 +430,9 @@ class LipschitzMLP(nn.Module):
         norm = torch.cat([torch.linalg.vector_norm(m.weight, 1, 1) for m in self.layers]) + 1e-9
         bound = torch.cat([b.expand(n) for b, n in zip(self.bounds(), rows)])  # (rows,)
         scale = (bound / norm).clamp(max=1)[:, None].split(rows)  # (out,1) of each layer
-        with half_precision(x):
-            for i, layer in enumerate(self.layers):
-                x = F.linear(F.relu(x) if i else x, layer.weight * scale[i], layer.bias)  # (P,out)
-        return x.float()
+        for i, layer in enumerate(self.layers):
+            x = F.linear(F.relu(x) if i else x, layer.weight * scale[i], layer.bias)  # (P,out)
+        return x
 
 
 def contract(x: Tensor) -> Tensor:
@@ -487,10 +462,9 @@ class Background(nn.Module):
         beyond = t1[:, None] + u / (1 - u).clamp(min=1e-3)  # (R,S-n)
         x = contract(rays.at(torch.cat([before, beyond], 1))).reshape(-1, 3)  # (RS,3)
         feat = torch.cat([x, self.octree(x).flatten(1)], 1)  # (RS,3+LC)
-        with half_precision(x):
-            density, geo = self.density(feat).float().split([1, GEO], 1)  # (RS,1), (RS,GEO)
-            inputs = torch.cat([geo, per_ray.repeat_interleave(S, 0)], 1)  # (RS,GEO+9+A)
-            rgb = self.color(inputs).float().sigmoid().reshape(R, S, 3)  # (R,S,3)
+        density, geo = self.density(feat).split([1, GEO], 1)  # (RS,1), (RS,GEO)
+        inputs = torch.cat([geo, per_ray.repeat_interleave(S, 0)], 1)  # (RS,GEO+9+A)
+        rgb = self.color(inputs).sigmoid().reshape(R, S, 3)  # (R,S,3)
         sigma = F.softplus(density.reshape(R, S) - 1)[:, :-1]  # (R,S-1)
         dt = torch.cat([dt.expand(-1, n), torch.diff(beyond)], 1)  # (R,S-1)
         alpha = F.pad(-torch.expm1(-sigma * dt), (0, 1), value=1.0)  # (R,S) [D8]
@@ -553,7 +527,7 @@ class SDFCache(nn.Module):
     """The SDF of the last steps on a dense grid: where along a ray samples pay. [D11]"""
     def __init__(self, n: int):
         super().__init__()
-        self.register_buffer("volume", torch.zeros(1, 1, n, n, n))  # x slowest
+        self.volume = nn.Buffer(torch.zeros(1, 1, n, n, n))  # x slowest
 
     @torch.no_grad()
     def refresh(self, sdf, part: int = 0, parts: int = 1) -> None:
@@ -677,11 +651,11 @@ def mask_at(logits: Tensor, uv: Tensor) -> Tensor:
     return torch.sigmoid(at).flatten()  # (R,)
 
 
-def edge_indicator(bend: Tensor, calibration: Tensor | None) -> Tensor:
-    """Phi of bend = lambda_grad E_grad + lambda_curv E_curv, any shape. Eq. 4 calibration (2,):
-    centre and width of the sigmoid [D3]. None is the literal reading: Phi then lies between 0.5 and
-    1 for every ray, a price that tells no edge."""
-    return torch.sigmoid(bend if calibration is None else (bend - calibration[0]) / calibration[1])
+def edge_indicator(bend: Tensor, calibration=(0.0, 1.0)) -> Tensor:
+    """Phi of bend = lambda_grad E_grad + lambda_curv E_curv, any shape. Eq. 4 calibration: centre
+    and width of the sigmoid [D3]; 0 and 1 are the literal reading, by which Phi lies between 0.5
+    and 1 for every ray, a price that tells no edge."""
+    return torch.sigmoid((bend - calibration[0]) / calibration[1])
 
 
 def gpl_loss(mask: Tensor, edge: Tensor) -> Tensor:
@@ -705,21 +679,15 @@ class TransientMask(nn.Module):
         super().__init__()
         self.cfg, self.thumbs, self.cgnet = cfg, scene.thumbs, CGNet()
         I, m = len(scene.thumbs), (scene.thumbs.shape[3] + 1) // 2
+        self.logits = nn.Buffer(torch.full((I, 1, m, m), -9.0))  # last output of the network
+        self.seen = nn.Buffer(torch.full((I, 5, m, m), -1.0))  # residual, bend, opacity; -1: no ray
+        self.calibration = nn.Buffer(torch.tensor([0.0, 1.0]))  # centre and width of Phi
+        self.usual = nn.Buffer(torch.tensor(0.3))  # running upper quartile of errors at SfM points
         static = torch.zeros(I, 1, m, m, dtype=torch.bool, device=scene.thumbs.device)
         ok = ((scene.track_uv >= 0) & (scene.track_uv < 1)).all(1)  # not those that SfM got wrong
         col, row = (scene.track_uv[ok] * m).long().unbind(1)  # (T,)
-        static[scene.track_photo[ok], 0, row, col] = True
-        for name, value in dict(
-                logits=torch.full((I, 1, m, m), -9.0),  # last output of the network
-                seen=torch.full((I, 5, m, m), -1.0),  # last residual, bend, opacity; -1: no ray yet
-                calibration=torch.tensor([0.0, 1.0]),  # centre and width of Phi
-                static=static,  # pixels that show an SfM point, but for outlines scene [D10]
-                usual=torch.tensor(0.3)).items():  # running upper quartile of such pixels' errors
-            self.register_buffer(name, value)
-
-    @property
-    def is_on(self) -> bool:
-        return self.cfg.mask != "off"
+        static[scene.track_photo[ok], 0, row, col] = True  # but for outlines scene [D10]
+        self.static = nn.Buffer(static)
 
     def look(self, pick: Tensor) -> Tensor:
         """Logits (B,1,m,m) of photos (B,)."""
@@ -742,8 +710,7 @@ class TransientMask(nn.Module):
     def phi(self, pick: Tensor) -> Tensor:
         """Phi times opacity (B,1,m,m) of photos (B,) as rays found it; 0 where none came."""
         bend, opacity = self.seen[pick, 3:].split(1, 1)  # (B,1,m,m)
-        calibration = self.calibration if self.cfg.gpl == "calibrated" else None
-        return opacity.clamp(min=0) * edge_indicator(bend, calibration)  # [D3]
+        return opacity.clamp(min=0) * edge_indicator(bend, self.calibration)  # [D3]
 
     def objective(self, pick: Tensor) -> tuple[Tensor, Tensor]:
         """The terms of Eq. 5 that hold M, over all pixels of photos (B,) that rays have seen, and
@@ -773,24 +740,16 @@ class TransientMask(nn.Module):
 
 # ---- 7 The model and its objective ---------------------------------------------------------------
 
-def random_cube(n: int, gen: torch.Generator) -> Tensor:
-    """Uniform points (n,3) in the cube around the unit sphere."""
-    return torch.empty(n, 3, device=gen.device).uniform_(-1, 1, generator=gen)
-
-
 def octrees_of(model: nn.Module) -> list[Octree]:
     return [part for part in model.modules() if isinstance(part, Octree)]
-
-
-BG_LEVELS = 5  # octree levels of the background, the last three only near SfM points
-TERMS = ("rgb", "eik", "curv", "lps", "off", "sfm")  # of Eq. 5; those that hold M: section 6
 
 
 class GeoNVS(nn.Module):
     """The paper's model: it assembles the parts above and sums their losses. What stands from
     `losses` on is what training and scoring ask of any model; rivals in the tests answer too."""
 
-    name = "geonvsw"
+    name, terms = "geonvsw", ("rgb", "eik", "curv", "lps", "off", "sfm")  # of Eq. 5 but for M's
+    bg_levels = 5  # octree levels of the background, the last three only near SfM points
     adam = dict(betas=(0.9, 0.99), eps=1e-15)  # as is usual for feature grids (Instant-NGP)
 
     def __init__(self, cfg: Config, scene: Scene):
@@ -801,8 +760,7 @@ class GeoNVS(nn.Module):
         self.sfm = scene.points[inside]  # (K,3)
         levels = cfg.levels or levels_for_footprint(float(raw["footprint"]))
         octree = Octree(1.0, levels, device=dev)
-        is_octree = len(self.sfm) > 0 and cfg.grid == "octree"
-        seed_octree(octree, self.sfm, 1 if is_octree else levels - 1)
+        seed_octree(octree, self.sfm, 1 if cfg.grid == "octree" else levels - 1)
         has_codes = dict(on=True, off=False, auto=raw["exposure_spread"] > 0.01)[cfg.appearance]
         has_field = dict(on=True, off=False, auto=np.isnan(raw["bg_color"]).any())[cfg.background]
         A = cfg.appearance_dim if has_codes else 0
@@ -812,17 +770,15 @@ class GeoNVS(nn.Module):
         self.color = LipschitzMLP([GEO + self.sdf.features + 3 + 9 + A, cfg.hidden, cfg.hidden, 3])
         self.background = None
         if has_field:
-            outer = Octree(2.0, BG_LEVELS, device=dev)
-            seed_octree(outer, contract(scene.points[~inside]), 1, BG_LEVELS - 2)
+            outer = Octree(2.0, self.bg_levels, device=dev)
+            seed_octree(outer, contract(scene.points[~inside]), 1, self.bg_levels - 2)
             self.background = Background(outer, cfg.hidden, 9 + A)
         self.deviation, self.mask = Deviation(), TransientMask(cfg, scene)
         self.cache = SDFCache(int(np.clip(octree.root << levels - 1, 64, 128)))
-        for name, value in dict(
-                bg_color=torch.as_tensor(raw["bg_color"]).float().nan_to_num(0.5),
-                hits=torch.full((512 * cfg.rays, 5), 2.0)).items():  # what refined_keys looks at
-            self.register_buffer(name, value)
-        lam = torch.tensor([1.0, *(getattr(cfg, f"lam_{k}") for k in TERMS[1:])])
-        self.register_buffer("lam", lam, persistent=False)  # flags may change it
+        self.bg_color = nn.Buffer(torch.as_tensor(raw["bg_color"]).float().nan_to_num(0.5))
+        self.hits = nn.Buffer(torch.full((512 * cfg.rays, 5), 2.0))  # what refined_keys looks at
+        lam = torch.tensor([1.0, *(getattr(cfg, f"lam_{k}") for k in self.terms[1:])])
+        self.lam = nn.Buffer(lam, persistent=False)  # flags may change it
         self.to(dev)
         print(f"  {levels} levels, finest cell {octree.cell(levels - 1):.4f}; appearance {A} "
               f"numbers; background {'a field' if has_field else 'one colour'}; mask {cfg.mask}")
@@ -846,13 +802,13 @@ class GeoNVS(nn.Module):
         out = render_rays(self, rays, self.appearance(rays.img), jitter)
         residual = out["rgb"] - rays.rgb  # (R,3)
         error = residual.abs().mean(1)  # (R,) L1
-        is_on = self.mask.is_on
+        is_on = cfg.mask != "off"
         mask = mask_at(self.mask.logits[pick], rays.uv) if is_on else torch.zeros_like(error)
         kept = (1 - mask) * error  # (R,) what the mask leaves of it
-        some = torch.randint(max(len(self.sfm), 1), (n,), generator=gen, device=gen.device)
-        sfm = self.sfm[some] if len(self.sfm) else self.sfm  # (n,3) or (0,3)
-        x = torch.cat([taps(out["x"], self.eps).reshape(-1, 3), random_cube(n, gen), sfm])
-        ends, off, sfm = self.distance(x).split([5 * R, n, len(sfm)])  # all points but the samples
+        sfm = self.sfm[torch.randint(len(self.sfm), (n,), generator=gen, device=gen.device)]
+        cube = torch.empty(n, 3, device=gen.device).uniform_(-1, 1, generator=gen)
+        x = torch.cat([taps(out["x"], self.eps).reshape(-1, 3), cube, sfm])
+        ends, off, sfm = self.distance(x).split([5 * R, n, n])  # all points but the samples
         lap = finite_differences(ends.reshape(R, 5), self.eps)[1]  # (R,) where rays end
         e_curv = lap.abs() * self.eps * out["opacity"]  # (R,) flat, not transparent [D13]
         terms = dict(rgb=kept.mean(),
@@ -860,8 +816,8 @@ class GeoNVS(nn.Module):
                      curv=e_curv.mean(),  # [D4]
                      lps=torch.log(self.color.bounds()).sum(),  # [D5]
                      off=torch.exp(-50 * off.abs()).mean(),
-                     sfm=sfm.abs().sum() / n)  # [D10]
-        total = torch.stack([terms[name] for name in TERMS]) @ self.lam
+                     sfm=sfm.abs().mean())  # [D10]
+        total = torch.stack([terms[name] for name in self.terms]) @ self.lam
         with torch.no_grad():  # what refining and the mask will want to know
             pixel = out["depth"] / self.scene.K[rays.img, 0]  # (R,) its size at the ray's end
             hits = torch.cat([out["x"], kept[:, None], pixel[:, None]], 1)  # (R,5)
@@ -870,14 +826,18 @@ class GeoNVS(nn.Module):
             bend = cfg.lam_grad * out["e_grad"] + cfg.lam_lap * e_curv  # (R,) [D3]
             self.mask.remember(rays, residual, bend, out["opacity"])
         if is_on and step % MASK_EVERY == 0:
-            self.mask.calibrate(bend)
+            self.mask.calibrate(bend, 0.2 if cfg.gpl == "calibrated" else 0.0)
             taught, terms["gpl"] = self.mask.objective(pick)  # lam_mask L_reg + lam_GPL L_GPL
             total = total + taught
         return total, terms | dict(mask=mask)
 
     def batch(self, photos: Tensor, n: int, gen: torch.Generator) -> tuple[Rays, Tensor]:
-        """n rays of one step and the photos (B,) they come from."""
-        return random_rays(self.scene, photos, n, self.cfg.photos, gen)
+        """n rays of one step and the photos (B,) they come from, drawn at random."""
+        B, wh, dev = self.cfg.photos, self.scene.wh, photos.device
+        pick = photos[torch.randint(len(photos), (B,), generator=gen, device=dev)]  # (B,)
+        img = pick.repeat_interleave(n // B)  # (R,) photo by photo, equally many from each
+        u = torch.rand(len(img), generator=gen, device=dev, dtype=torch.float64)  # (R,)
+        return make_rays(self.scene, img, (u * wh[img].prod(1)).long()), pick
 
     def groups(self) -> list[dict]:
         """Optimiser groups: what is looked up fast, networks slower, mask and zeta apart: its eps
@@ -894,10 +854,9 @@ class GeoNVS(nn.Module):
         """Warm-up: L_sphere fits the SDF to a sphere. A small one: a surface that starts inside the
         landmark grows to it, one that starts outside also has to be carved out of the sky."""
         grid, *nets = self.sdf.parameters()
-        groups = dict(params=[grid], lr=1e-3), dict(params=nets, lr=5e-3)
-        adam = torch.optim.Adam(groups, fused=True)
+        adam = torch.optim.Adam([dict(params=[grid], lr=1e-3), dict(params=nets)], 5e-3, fused=True)
         for _ in range(steps):
-            x = random_cube(1024, gen)  # (P,3)
+            x = torch.empty(1024, 3, device=gen.device).uniform_(-1, 1, generator=gen)  # (P,3)
             loss = ((self.distance(x) - (x.norm(dim=1) - radius)) ** 2).mean()
             adam.zero_grad()
             loss.backward()
@@ -912,8 +871,8 @@ class GeoNVS(nn.Module):
         if cfg.grid == "octree":
             keys = refined_keys(octree, self.distance, self.hits, zeta, cfg.max_mb)
         if is_last and mask == "auto":
-            logits = self.mask.logits[self.mask.logits != -9]  # of photos that it has seen
-            share = logits.sigmoid().mean().item()
+            logits = self.mask.logits[self.scene.photos(False)]  # (B,1,m,m)
+            share = logits[logits != -9].sigmoid().mean().item()  # of photos that it has seen
             mask = "on" if share > 0.01 else "off"
             print(f"  mean mask {share:.4f}: mask {mask}")
         return dict(keys=keys.cpu(), mask=mask)
@@ -946,11 +905,10 @@ def open_counter(device: torch.device, rapl: str = "/sys/class/powercap"):
     if device.type == "cuda":
         import pynvml
         pynvml.nvmlInit()
-        uuid = torch.cuda.get_device_properties(device).uuid
-        gpu = pynvml.nvmlDeviceGetHandleByUUID(f"GPU-{uuid}")
-        return lambda: pynvml.nvmlDeviceGetTotalEnergyConsumption(gpu) / 1e3  # mJ
-    if LOCAL_RANK:  # one process reads for a machine
-        return float
+        used = range(RANKS) if RANKS > 1 else [device]  # the first process reads for all
+        uuids = [torch.cuda.get_device_properties(gpu).uuid for gpu in used]
+        gpus = [pynvml.nvmlDeviceGetHandleByUUID(f"GPU-{uuid}") for uuid in uuids]
+        return lambda: sum(map(pynvml.nvmlDeviceGetTotalEnergyConsumption, gpus)) / 1e3  # mJ
     packages = [p for p in Path(rapl).glob("intel-rapl:*") if p.name.count(":") == 1]
     need(packages, f"no counter in {rapl}")
     return lambda: sum(int((p / "energy_uj").read_text()) for p in packages) / 1e6
@@ -987,11 +945,11 @@ RANK, LOCAL_RANK, RANKS = (int(os.environ.get(name, default)) for name, default 
     ("RANK", 0), ("LOCAL_RANK", 0), ("WORLD_SIZE", 1)))
 
 
-def agreed(value, source: int = 0):
-    """The value that one process has, for all of them."""
+def agreed(value):
+    """The value that the first process has, for all of them."""
     box = [value]
     if RANKS > 1:
-        dist.broadcast_object_list(box, source)
+        dist.broadcast_object_list(box)
     return box[0]
 
 
@@ -1035,7 +993,6 @@ def read_checkpoint(path: Path, given: dict) -> tuple[dict, Config]:
         data_prep.refuse_bomb(path)
         saved = dict(torch.load(path, map_location="cpu", weights_only=True))
         cfg = Config(**saved["config"])
-        check(replace(cfg, rays=cfg.rays * RANKS))  # main checks how many processes share them
         need(saved["state"]["step"] >= 0, "")
     except Exception as error:  # a damaged file can fail in any layer: zip, pickle, tensor storage
         raise UserError(f"{path} is damaged or not a checkpoint of this program "
@@ -1095,8 +1052,7 @@ def train(cfg: Config, scene: Scene, run: Path, saved: dict | None = None, kind=
         if is_over or seconds > next_line:
             state["dropped"] = int(dropped)  # waits for a GPU's queue
             meter.tick()
-            joules = [spent, *(agreed(meter.joules, i) for i in range(RANKS))]
-            joules = None if None in joules else sum(joules)
+            joules = None if None in (spent, meter.joules) else spent + meter.joules
             state |= dict(joules=joules, energy_wh=joules and joules / 3600, source=meter.source,
                           seconds=agreed(time.perf_counter() - begin))
             RANK or report(model, run / "log.jsonl", progress, state, terms)
@@ -1111,9 +1067,8 @@ def train(cfg: Config, scene: Scene, run: Path, saved: dict | None = None, kind=
         if state["refined"] < len(REFINE_AT) and progress >= REFINE_AT[state["refined"]]:
             state["refined"] += 1
             model.follow(agreed(model.plan(state["refined"] == len(REFINE_AT))), optimizer)
-    need(not has_diverged, f"the last {int(streak)} steps had no finite loss or gradient; likely: "
-         "learning rates too high (try a third of --lr_grid and --lr_net) or broken poses; "
-         f"{path} holds the last good weights")
+    need(not has_diverged, f"{int(streak)} steps in a row had no finite loss: mend poses, or try a "
+         f"third of the learning rates --lr_grid, --lr_net; {path} holds the last good weights")
     return model, state
 
 
@@ -1121,7 +1076,7 @@ def train(cfg: Config, scene: Scene, run: Path, saved: dict | None = None, kind=
 def report(model, path: Path, progress: float, state: dict, terms: dict) -> None:
     """A line on the terminal and one in log.jsonl. psnr and opacity: of 1,024 fixed rays."""
     gen = torch.Generator(model.scene.c2w.device).manual_seed(0)
-    rays, _ = random_rays(model.scene, model.scene.photos(False), 1024, 64, gen)
+    rays, _ = model.batch(model.scene.photos(False), 1024, gen)
     out = model.render(rays, model.codes()[rays.img])
     more = dict(zeta=model.deviation(), opacity=out["opacity"]) if hasattr(model, "sdf") else {}
     line = {k: state[k] for k in ("step", "seconds", "dropped", "energy_wh")}
@@ -1247,7 +1202,7 @@ def toy_truth(model, scene: Scene) -> dict:
                              info["background"], info["landmark"]) / raw["scale"]  # (P,)
     s = torch.cat([model.distance(part) for part in x.split(CHUNK)]).cpu().numpy()  # (P,)
     error = float(np.abs(s - true)[np.abs(true) < 0.05].mean())
-    if not model.mask.is_on:
+    if model.cfg.mask == "off":
         return dict(sdf_error=error, mask_iou=None, mask_static=None)
     mask = torch.cat([mask_at(model.mask.look(i), rays.uv[rays.img == i])
                       for i in scene.photos(False)[:, None]]).cpu().numpy()  # (R,)
@@ -1322,6 +1277,7 @@ def finish(model, scene: Scene, state: dict, run: Path) -> dict:
                render_photo(model, scene, i, model.codes()[i])) for i in busy[:2].tolist()]
     picture = panel(model, frames + scores.pop("frames"))[:, :, ::-1]
     atomic_write(run / "panel.png", lambda tmp: cv2.imwrite(str(tmp), picture))
+    parameters = sum(p.numel() for p in model.parameters())
     git = ["git", "-C", Path(__file__).parent, "rev-parse", "--short", "HEAD"]
     metrics = dict(
         scene=scene.info["scene"], method=model.name, seed=cfg.seed, steps=state["step"],
@@ -1330,11 +1286,9 @@ def finish(model, scene: Scene, state: dict, run: Path) -> dict:
         train_seconds=state["seconds"], dropped=state["dropped"],
         energy_wh=state["energy_wh"], energy_source=state["source"],
         rays_per_second=state["step"] * cfg.rays / max(state["seconds"], 1e-9),
-        parameters=sum(p.numel() for p in model.parameters()),
         octree_cells=octrees and octrees[0].cells[:, 0].bincount().tolist() or None,
-        model_bytes=sum(p.numel() * 4 for p in model.parameters()) + sum(
-            o.bytes() - 4 * o.features.numel() for o in octrees),
-        peak_memory_bytes=peak, torch=torch.__version__, config=asdict(cfg),
+        model_bytes=4 * parameters + sum(4 * (o.child.numel() + o.corner.numel()) for o in octrees),
+        peak_memory_bytes=peak, parameters=parameters, torch=torch.__version__, config=asdict(cfg),
         protocol="appearance fitted on the left half, scored on the right half",
         commit=shutil.which("git") and subprocess.run(
             git, capture_output=True, text=True).stdout.strip() or None)
@@ -1381,10 +1335,7 @@ def film(model, scene: Scene, path: Path, rays: float = 4e6) -> None:
 def make_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0], allow_abbrev=False,
                                      argument_default=argparse.SUPPRESS)
-
-    def error(message):  # bad flags end with one sentence
-        raise UserError(f"{message} (python geonvs.py --help lists all flags)")
-    parser.error = error
+    parser.error = lambda message: need(False, f"{message}: see python geonvs.py --help")
     for f in fields(Config):
         parser.add_argument(f"--{f.name}", type=type(f.default), choices=f.metadata["choices"],
                             help=f"{f.metadata['help']} [{f.default}]")
@@ -1404,25 +1355,11 @@ def pick_device(name: str) -> torch.device:
     return torch.device(chosen)
 
 
-def check(cfg: Config) -> None:
-    """Refuses settings that cannot work, before anything is written."""
-    least = dict(samples=2, bg_samples=2, rays=2, photos=1, steps=1, downscale=1, hidden=1)
-    for f in fields(cfg):
-        value, low = getattr(cfg, f.name), least.get(f.name, 0)
-        is_right = (isinstance(value, str) if f.type == "str" else low <= value < 2 ** 63)
-        need(is_right and value in (f.metadata["choices"] or [value]),
-             f"--{f.name} {value} makes no sense: use a number from {low}, or see --help")
-    need(cfg.levels <= 9, "--levels goes up to 9: 4096 cells a side")
-    need(cfg.rays % (cfg.photos * RANKS) == 0,
-         f"--rays {cfg.rays} must be a multiple of --photos {cfg.photos} times the processes")
-
-
 def make_config(given: dict) -> Config:
-    """Config's defaults, then the scene's settings (of a folder the large ones on a GPU), then
-    flags."""
+    """Config's defaults, then LARGE if photos meet a GPU, then flags."""
+    is_toy = not given.get("data") and given.get("scene", "toy") == "toy"
     has_gpu = given.get("device") != "cpu" and torch.cuda.is_available()
-    of_folder = LARGE if has_gpu else {}
-    return Config(**(of_folder if given.get("data") else SCENES[given.get("scene", "toy")]) | given)
+    return Config(**(LARGE if has_gpu and not is_toy else {}) | given)
 
 
 def execute(cfg: Config, arrays: dict, run: Path, saved: dict | None = None, kind=GeoNVS) -> dict:
@@ -1448,7 +1385,8 @@ def main(argv: list[str] | None = None) -> None:
     run = Path("runs") / (cfg.name or f"{where}-{GeoNVS.name}-{cfg.seed}")
     if resume or render:
         saved, cfg = read_checkpoint(run / "checkpoint.pt", given)
-    check(cfg)
+    need(cfg.rays % (cfg.photos * RANKS) == 0,
+         f"--rays {cfg.rays} must be a multiple of --photos {cfg.photos} times the processes")
     device = pick_device(cfg.device)
     if device.type == "cuda":
         torch.cuda.set_device(device)
