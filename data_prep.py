@@ -8,8 +8,8 @@
 The landmark lies in the unit sphere. A ray is c2w[:, 3] + t * d with |d| = 1; a distance is this t,
 never a z-depth. Functions raise UserError, one sentence that says what to do.
 """
-import argparse, gzip, http.client, inspect, io, itertools, json, math, os, shutil, struct, sys
-import tarfile, tempfile, time, urllib.request, zipfile, zlib
+import argparse, contextlib, gzip, http.client, inspect, io, itertools, json, math, os, shutil
+import struct, sys, tarfile, tempfile, time, urllib.request, zipfile, zlib
 from pathlib import Path
 
 import cv2
@@ -475,7 +475,9 @@ def read_photo(path, camera, downscale):
     """Undistorted, then reduced. -> rgb uint8 (h,w,3), K (4,)"""
     w, h, K, bend = camera
     need(1 <= downscale <= min(w, h) / 2, f"--downscale {downscale} leaves nothing of {path}")
-    image = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)   # as COLMAP
+    image = None
+    with contextlib.suppress(cv2.error):   # more than a gigapixel
+        image = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)   # COLMAP's
     need(np.shape(image)[:2] == (h, w), f"{path} is no photo of {w} x {h}: replace or delete it")
     if bend.any():   # OpenCV's first pixel is at 0
         M = np.array([[K[0], 0, K[2] - 0.5], [0, K[1], K[3] - 0.5], [0, 0, 1]])
@@ -624,10 +626,8 @@ def main(argv=None):
     wrong = given.keys() - inspect.signature(make).parameters
     try:
         need(not wrong, f"--{' --'.join(wrong)}: not for {name}")
-        if fetch_first:
-            download(name)
-        if sfm_first:
-            run_sfm(Path(name))
+        fetch_first and download(name)
+        sfm_first and run_sfm(Path(name))
         scene = make(**given) if name == "toy" else make(name, **given)
         write_scene(path, scene)
     except (UserError, OSError, MemoryError, ImportError, KeyboardInterrupt) as e:

@@ -560,8 +560,8 @@ class SDFCache(nn.Module):
 
 
 def render_rays(model: "GeoNVS", rays: Rays, code: Tensor, jitter: Tensor) -> dict[str, Tensor]:
-    """One ray batch through the whole model. code: (R,A) appearance; jitter: (R,S+B) in 0..1, for
-    the B background samples too. Returns rgb (R,3), eikonal error of each sample (R,S), and without
+    """One ray batch through the whole model. code: (R,A) appearance; jitter in 0..1, for S samples
+    and those of the background. Returns rgb (R,3), eikonal error of each sample (R,S), and without
     gradient opacity, depth (R,), normal, the ray's end x (R,3), E_grad of Eq. 4 (R,)."""
     cfg, R, S, zeta = model.cfg, len(rays.o), model.cfg.samples, model.deviation()
     t0, t1 = sphere_interval(rays)  # (R,)
@@ -1014,9 +1014,8 @@ def restore(saved: dict, path: Path, model, gen=None) -> torch.optim.Adam:
             gen.set_state(saved["rng"])
         return optimizer
     except (LookupError, ValueError, RuntimeError, TypeError, AttributeError, UserError) as error:
-        raise UserError(f"{path} does not fit this scene and these settings "
-                        f"({str(error).splitlines()[0][:90]}): delete it or use the flags and "
-                        "the kind of device it was made with") from None
+        raise UserError(f"{path} does not fit this scene and these settings ({error!r:.90}): use "
+                        "the flags and the kind of device it was made with, or delete it") from None
 
 
 def train(cfg: Config, scene: Scene, run: Path, saved: dict | None = None, kind=GeoNVS):
@@ -1314,7 +1313,8 @@ def film(model, scene: Scene, path: Path, rays: float = 4e6) -> None:
     view = order[len(order) // 2]  # the middle camera
     shots = [(pose, codes.mean(0)) for pose in poses]
     shots += [(c2w[view], code) for code in between(codes)] if codes.numel() else []
-    wh, K, near = (a[photos[view]][None] for a in (scene.wh, scene.K, scene.near))
+    wh, K = (a[photos[view]][None] for a in (scene.wh, scene.K))
+    near = scene.near[photos].min()[None]  # as cameras between the photos may be nearer
     budget = rays * (50 if wh.is_cuda else 1) / len(shots)
     scale = min(1.0, math.sqrt(budget / wh.prod().item()))
     one = scene._replace(wh=(wh * scale / 2).long() * 2, K=K * scale, near=near)  # even sides

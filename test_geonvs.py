@@ -5,7 +5,7 @@ The tests come from properties: naive loops in float64, closed forms, limits, in
 needs data, network or a GPU, nothing is skipped, and no timing decides.
 """
 import ast, contextlib, copy, dataclasses, functools, http.server, inspect, io, itertools, json, math, os, pickle, re
-import resource, shutil, socket, struct, subprocess, sys, tarfile, threading, time, tracemalloc, types, zipfile
+import resource, shutil, socket, struct, subprocess, sys, tarfile, threading, time, tracemalloc, types, zipfile, zlib
 from dataclasses import asdict, fields
 from pathlib import Path
 from types import SimpleNamespace
@@ -422,6 +422,9 @@ CASES = {   # what is changed of cameras {}, images [[]], points []; or on disk
     "only test": (lambda c, i, p: [j.__setitem__(5, []) for j in i if j[4][6] not in "27"], "no training photo"),
     "size": (lambda *_: cv2.imwrite(str(PHOTO), np.zeros((7, 9, 3), np.uint8)), "toy_000.png"),
     "no photo": (lambda *_: PHOTO.write_text("x"), "toy_000.png"),
+    "two gigapixels": (lambda *_: PHOTO.write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(
+        struct.pack(">I", len(part) - 4) + part + struct.pack(">I", zlib.crc32(part)) for part in (
+            struct.pack(">4sIIBBBBB", b"IHDR", 60_000, 40_000, 8, 2, 0, 0, 0), b"IDAT", b"IEND"))), "toy_000.png"),
     "two splits": (lambda *_: Path("place/b.tsv").write_text("x"), "--split"),
     "one train": (lambda *_: Path("place/toy.tsv").write_text("filename\tsplit\ntoy_000.png\ttrain\n"), "split file"),
     "no images": (lambda *_: PHOTO.parent.rename("place/elsewhere"), "place --sfm"),
