@@ -2261,10 +2261,12 @@ def test_the_right_half_is_scored_in_8_bits_beside_the_mean_colour_of_each_row_o
 
 
 def test_fitting_codes_starts_from_the_mean_sees_left_halves_only_and_touches_no_scene(warm, scene, monkeypatch):
-    photos, model, fitted, seen, make_rays = scene.photos(True), copy.deepcopy(warm), [], [], g.make_rays
+    photos, model, fitted, seen, rates, make_rays = scene.photos(True), copy.deepcopy(warm), [], [], [], g.make_rays
     with monkeypatch.context() as patch:
         patch.setattr(g, "make_rays", lambda *args: seen.append(rays := make_rays(*args)) or rays)
+        patch.setattr(torch.optim.Adam, "step", lambda adam: rates.append(adam.param_groups[0]["lr"]))
         g.fit_codes(model, scene, photos, 8, 500)
+    close(rates, np.geomspace(0.1, 0.01, 9)[:8])
     for photo in photos.tolist():  # every pixel of the left half, and no other
         w, h = scene.wh[photo].tolist()
         places = {tuple(uv) for rays in seen for uv in (rays.uv[rays.img == photo] * scene.wh[photo]).int().tolist()}
@@ -2416,6 +2418,8 @@ def test_one_command_trains_scores_and_writes_everything_and_others_go_on_and_fi
     own = config(levels=3, seed=3, mask="on")  # what auto came to
     assert metrics["config"] == asdict(own) and metrics["commit"] is None and metrics["psnr"] > 5
     assert metrics["rays_per_second"] == pytest.approx(6 * 64 / metrics["train_seconds"])
+    beyond = metrics["model_bytes"] - 4 * metrics["parameters"] - 36 * (8 + sum(metrics["octree_cells"]))
+    assert beyond > 36 * 16 ** 3 and beyond % 36 == 0  # nodes of the background's octree
     assert command("--resume", "--seed=3", "--steps=8") is None  # with the run's own settings
     assert json.loads((run / "metrics.json").read_text())["config"] == asdict(dataclasses.replace(own, steps=8))
     assert "--photos" in command("--resume", "--seed=3", "--rays=66")  # settings of a resumed run are checked too
