@@ -1098,6 +1098,9 @@ def test_seeding_splits_dense_levels_then_the_neighbourhood_of_points():
     assert octree.features[g.PINNED:].square().mean().sqrt().item() == pytest.approx(0.01, rel=0.1)
     node = octree.locate(torch.tensor([[-9, 1.6, 9]]))[0][0]
     assert octree.cells[node[:2] - 8].tolist() == [[0, 0, 7, 7], [1, 0, 15, 15]] and node[2] < 8  # no cell there
+    g.seed_octree(deep := g.Octree(1.6, 5, 1, root=8), points, 1, 3)  # down to the points, and only there
+    assert (deep.corner[deep.locate(points)[0]] >= g.PINNED).all() and counts(deep)[:3] == counts(octree)
+    assert 7 * 27 < counts(deep)[4] <= 8 * 27 * 7 and counts(deep)[3] <= 8 * 27 * 7
     for levels, dense in ((3, 2), (2, 1), (1, 1)):  # fine everywhere
         g.seed_octree(uniform := g.Octree(1.0, levels, 1, root=4), points, dense)
         assert counts(uniform) == [64, 512, 4096][:levels]
@@ -1857,6 +1860,9 @@ def test_a_mask_that_is_nearly_empty_goes_off_at_the_last_plan(scene, setting, m
     model = new_model(scene, mask=setting)
     model.mask.logits[[is_test in masked for is_test in scene.is_test.tolist()], :, :99 if True in masked else 1] = 9.0
     assert (model.plan(is_last)["mask"] != "off") is stays and model.cfg.mask == setting
+    model.mask.logits[:] = -9.0  # one photo has been looked at, and 2 % of it are masked: that is no empty mask
+    model.mask.logits[scene.photos(False)[0]] = torch.where(torch.arange(48) > 0, -8.0, 9.0)[:, None]
+    assert model.plan(True)["mask"] != "off"
 
 
 def test_a_plan_refines_by_what_the_model_remembers(warm, monkeypatch):
@@ -2365,8 +2371,8 @@ def test_mesh_of_the_warm_up_sphere_is_that_sphere_closed_looking_outwards_and_r
 def test_a_film_goes_from_camera_to_camera_and_then_through_the_lights(warm, scene, tmp_path, monkeypatch, count):
     few = scene._replace(is_test=~torch.isin(torch.arange(10), photos := scene.photos(False)[:count]))
     monkeypatch.setattr(g, "render_photo", lambda model, moved, view, code: shots.append(
-        (moved.c2w[view], code)) or dict(rgb=np.zeros((*moved.wh[view].tolist()[::-1], 3))))
-    shots, path = [], tmp_path / "a.mp4"
+        (moved.c2w[view], code)) or nears.append(moved.near[view].item()) or dict(rgb=np.zeros((*moved.wh[view].tolist()[::-1], 3))))
+    shots, nears, path = [], [], tmp_path / "a.mp4"
     g.film(warm, few, path)
     video = g.cv2.VideoCapture(str(path))
     (poses, codes), half = (torch.stack(part) for part in zip(*shots)), len(shots) // 2
@@ -2378,6 +2384,7 @@ def test_a_film_goes_from_camera_to_camera_and_then_through_the_lights(warm, sce
     assert (ends[0] - ends[1]).norm() >= 0.9 * torch.cdist(eyes, eyes).max()
     assert (poses[half:] == poses[half]).all() and (codes[:half] == codes[0]).all()
     close(codes[[half, -1]], warm.codes()[photos[[0, -1]]], atol=1e-3)
+    assert set(nears) == {scene.near[photos].min().item()}
     g.film(warm, few, path, rays=1e4)
     assert 0.5e4 < np.prod(g.cv2.VideoCapture(str(path)).read()[1].shape[:2]) * half * 2 <= 1e4
 
