@@ -92,8 +92,6 @@ class Config:
     lam_eik: float = opt(0.04, "weight of the eikonal loss (Permuto-SDF)")
     lam_curv: float = opt(3e-3, "weight of the curvature loss, on |lap| eps [D4] [R]")
     lam_gpl: float = opt(0.05, "weight of the geometry-preservation loss (paper)")
-    lam_grad: float = opt(10.0, "weight of the eikonal error inside Phi (paper)")
-    lam_lap: float = opt(2.0, "weight of the curvature inside Phi (the paper's lambda_curv = 2)")
     lam_lps: float = opt(1e-5, "weight of the Lipschitz loss, log form [D5] [R]")
     lam_off: float = opt(1e-3, "weight of the off-surface loss [R]")
     lam_sfm: float = opt(0.3, "weight of |s(p)| at SfM points [D10]")
@@ -189,11 +187,12 @@ def sphere_interval(rays: Rays) -> tuple[Tensor, Tensor]:
 
 # ---- 3 Octree: features on the corners of cells --------------------------------------------------
 
-# (8,32): the monomials 1 z y yz x xz xy xyz of a position in a cell times this are the weights of
-# the 8 corners, then their derivatives along x, y, z. Per axis the ends weigh 1 - f and f.
-VALUE, SLOPE = torch.tensor([[[1.0, 0], [-1, 1]], [[-1, 1], [0, 0]]])  # (2,2) each, rows 1, f
-TRILINEAR = torch.cat([torch.kron(x, torch.kron(y, z)) for x, y, z in (
-    3 * [VALUE], (SLOPE, VALUE, VALUE), (VALUE, SLOPE, VALUE), (VALUE, VALUE, SLOPE))], 1)
+# A corner's weight is a product over the axes: 1 - f at the near end, f at the far end, for f in
+# 0..1. Columns: the 8 corners' weights, then their derivatives, where an axis has its slope, -1, 1.
+FAR = torch.cartesian_prod(*[torch.arange(2.0)] * 3).T.repeat(1, 4)  # (3,32) 1 at the far end
+IS_SLOPE = F.pad(torch.eye(3), (1, 0)).repeat_interleave(8, 1) > 0  # (3,32)
+TRILINEAR = torch.stack([torch.where(IS_SLOPE, 2 * FAR - 1, 1 - FAR),  # (2,3,32) constant and
+                         torch.where(IS_SLOPE, 0, 2 * FAR - 1)])  # factor of f
 PINNED = 64  # rows that stay zero, for hanging corners: on one row a GPU would queue their writes
 CHUNK = 4096  # points or rays evaluated at once outside training; of rays 4 times that on a GPU
 resident = functools.cache(Tensor.to)  # a constant on a device: one copy, as copies make a GPU wait
@@ -235,7 +234,7 @@ class Octree(nn.Module):
         self.row_key = torch.arange(-PINNED, 0, device=device)  # (V,) the corner that owns a row
         constant = lambda value: nn.Buffer(value.to(device), persistent=False)
         self.per_unit = constant(1 / self.cell(torch.arange(levels)))  # (L,)
-        self.trilinear = constant(TRILINEAR)  # (8,32)
+        self.trilinear = constant(TRILINEAR)  # (2,3,32)
         steps = torch.tensor([[-1, root ** 2, root, 1], *[[1, 4, 2, 1]] * (levels - 1)]).int()
         self.bits, self.stride = constant(steps[:, :1]), constant(steps[:, 1:])  # (L,1), (L,3)
         self.build(self.row_key[:0])
@@ -299,10 +298,9 @@ class Octree(nn.Module):
         """Features (P,L,J,C) at x (P,3); J = 1, or 4: value, its change per cell along x, y, z."""
         P, L, J = len(x), self.active, 4 if derivatives else 1
         nodes, inside = self.locate(x)  # (P,L), (P,L,3)
-        one = torch.stack([torch.ones_like(inside), inside], 3).reshape(-1, 3, 2)  # (PL,3,2)
-        fx, fy, fz = one[:, 0, :, None, None], one[:, 1, :, None], one[:, 2, None]
-        basis = (fx * (fy * fz)[:, None]).reshape(-1, 8)  # (PL,8) 1 z y yz x xz xy xyz
-        w = (basis @ self.trilinear[:, :8 * J]).reshape(-1, J, 8)  # (PL,J,8)
+        axes = zip(*self.trilinear[:, :, :8 * J], inside.reshape(-1, 3, 1).unbind(1))
+        x, y, z = (torch.addcmul(start, f, rise) for start, rise, f in axes)  # (PL,8J)
+        w = (x * y * z).reshape(-1, J, 8)  # (PL,J,8)
         corner = self.corner.index_select(0, nodes.flatten())  # (PL,8)
         out = Interpolate.apply(self.features, corner, w).reshape(P, L, J, self.features.shape[1])
         return F.pad(out, (0, 0, 0, 0, 0, self.levels - L)) if L < self.levels else out
@@ -651,6 +649,9 @@ def mask_at(logits: Tensor, uv: Tensor) -> Tensor:
     return torch.sigmoid(at).flatten()  # (R,)
 
 
+LAM_GRAD, LAM_LAP = 10.0, 2.0  # lambda_grad and lambda_curv inside Phi (paper)
+
+
 def edge_indicator(bend: Tensor, calibration=(0.0, 1.0)) -> Tensor:
     """Phi of bend = lambda_grad E_grad + lambda_curv E_curv, any shape. Eq. 4 calibration: centre
     and width of the sigmoid [D3]; 0 and 1 are the literal reading, by which Phi lies between 0.5
@@ -823,7 +824,7 @@ class GeoNVS(nn.Module):
             hits = torch.cat([out["x"], kept[:, None], pixel[:, None]], 1)  # (R,5)
             first = step * R % len(self.hits)
             self.hits[first:first + R] = hits.nan_to_num(2, 2, 2)
-            bend = cfg.lam_grad * out["e_grad"] + cfg.lam_lap * e_curv  # (R,) [D3]
+            bend = LAM_GRAD * out["e_grad"] + LAM_LAP * e_curv  # (R,) [D3]
             self.mask.remember(rays, residual, bend, out["opacity"])
         if is_on and step % MASK_EVERY == 0:
             self.mask.calibrate(bend, 0.2 if cfg.gpl == "calibrated" else 0.0)
