@@ -97,7 +97,7 @@ class Config:
     lam_sfm: float = opt(0.3, "weight of |s(p)| at SfM points [D10]")
     lam_mask: float = opt(0.04, "weight of mean M: the excess error that masks a pixel [D7]")
     lr_grid: float = opt(1e-2, "learning rate of octree features and appearance codes")
-    lr_net: float = opt(2e-3, "learning rate of networks")
+    lr_net: float = opt(4e-3, "learning rate of networks")
     lr_zeta: float = opt(1e-3, "learning rate of the deviation network")
 
     def __post_init__(self):  # refuses what cannot work, before anything is written
@@ -683,7 +683,8 @@ class TransientMask(nn.Module):
         self.logits = nn.Buffer(torch.full((I, 1, m, m), -9.0))  # last output of the network
         self.seen = nn.Buffer(torch.full((I, 5, m, m), -1.0))  # residual, bend, opacity; -1: no ray
         self.calibration = nn.Buffer(torch.tensor([0.0, 1.0]))  # centre and width of Phi
-        self.usual = nn.Buffer(torch.tensor(0.3))  # running upper quartile of errors at SfM points
+        self.usual = nn.Buffer(torch.full((2,), 0.3))  # running upper quartiles of errors at SfM
+        # points: of what is seen beside the foreground, where the model draws less well, and of it
         static = torch.zeros(I, 1, m, m, dtype=torch.bool, device=scene.thumbs.device)
         ok = ((scene.track_uv >= 0) & (scene.track_uv < 1)).all(1)  # not those that SfM got wrong
         col, row = (scene.track_uv[ok] * m).long().unbind(1)  # (T,)
@@ -732,9 +733,13 @@ class TransientMask(nn.Module):
             return paid.mean() + pole + cfg.lam_gpl * gpl, gpl.detach()
         around = F.avg_pool2d(torch.cat([residual * known, known], 1), 3, 1, 1)  # (B,4,m,m)
         error = (around[:, :3] / around[:, 3:].clamp(min=0.1)).abs().amax(1, True)  # (B,1,m,m)
-        usual = torch.where(static & (known > 0), error, math.nan).nanquantile(0.75)
+        solid = (self.seen[pick, 4:] > 0.5).long()  # (B,1,m,m) 1: the foreground, 0: beside it
+        told = torch.where(static & (known > 0), error, math.nan)  # (B,1,m,m)
+        usual = torch.stack([torch.where(solid == i, told, math.nan).nanquantile(0.75)
+                             for i in (0, 1)])  # (2,)
         self.usual.lerp_(torch.where(usual.isnan(), self.usual, usual), 0.1)
-        price = cfg.lam_mask + self.usual + cfg.lam_gpl * phi - error * ~static  # (B,1,m,m) [D7]
+        price = cfg.lam_mask + self.usual[solid] + cfg.lam_gpl * phi  # (B,1,m,m) [D7]
+        price = price - error * ~static  # (B,1,m,m)
         slope = F.softplus(torch.where(price > 0, logits, -logits))  # (B,1,m,m)
         return (price.abs() * slope * known).mean() + pole, gpl.detach()
 

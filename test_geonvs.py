@@ -4,9 +4,9 @@ NeRF-W and Ha-NeRF and the experiments, run by name.
 The tests come from properties: naive loops in float64, closed forms, limits, invariances, round trips; nothing
 needs data, network or a GPU, nothing is skipped, and no timing decides.
 """
-import ast, contextlib, copy, dataclasses, functools, http.server, inspect, io, itertools, json, math, os, pickle, re
-import resource, shutil, socket, struct, subprocess, sys, tarfile, threading, time, tracemalloc, types, zipfile, zlib
-from dataclasses import asdict, fields
+import ast, contextlib, copy, functools, http.server, importlib.util, inspect, io, itertools, json, math, os, pickle
+import re, resource, shutil, socket, struct, subprocess, sys, tarfile, threading, time, tracemalloc, zipfile, zlib
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -486,22 +486,18 @@ def damaged(tmp_path_factory, request):
     return functools.partial(survives, read, path), path.read_bytes(), promise
 
 
-def test_truncation_and_promised_counts_are_noticed_before_memory_is_taken(damaged):
-    read, data, promise = damaged
+def test_truncation_and_promised_counts_are_noticed_before_memory_is_taken_and_damage_does_no_harm(damaged):
+    (read, data, promise), rng = damaged, np.random.default_rng(0)
     assert read(data) and (b"filename" in data or not any(read(data[:n]) for n in range(len(data))))
     for at in {0, promise}:
         for count in (4, 1000, 2 ** 31, 2 ** 40, 2 ** 63, 2 ** 64 - 1):
             result, size = peak(read, data[:at] + struct.pack("<Q", count) + data[at + 8:])
             assert result is None and size < 2 ** 20
-
-
-@pytest.mark.parametrize("seed", range(40))
-def test_random_and_flipped_bytes_do_no_harm(damaged, seed):
-    (read, good, _), rng = damaged, np.random.default_rng(seed)
-    junk = rng.bytes(rng.integers(200))
-    read(flipped(good, rng.integers(8 * len(good), size=seed % 5)))
-    read(struct.pack("<Q", seed % 4) + junk)
-    read(b"filename\tid\tsplit\n" + junk)
+    for i in range(40):
+        junk = rng.bytes(rng.integers(200))
+        read(flipped(data, rng.integers(8 * len(data), size=i % 5)))
+        read(struct.pack("<Q", i % 4) + junk)
+        read(b"filename\tid\tsplit\n" + junk)
 
 
 def zipped(scene, save=np.savez):
@@ -512,8 +508,7 @@ def zipped(scene, save=np.savez):
 
 @pytest.fixture(scope="module")
 def stored():
-    scene = data_prep.make_toy(size=16, photos=4, test=1)
-    return scene, zipped(scene)
+    return (scene := data_prep.make_toy(size=16, photos=4, test=1)), zipped(scene)
 
 
 def readable(path, data):
@@ -564,13 +559,10 @@ def test_bombs_and_promised_shapes_are_refused(tmp_path, stored):
         assert not readable(path, path.read_bytes())
 
 
-class Evil:
-    """Makes a file when it is unpickled."""
-    def __init__(self, path):
-        self.path = path
-
+class Evil(str):
+    """Makes a folder of this name when it is unpickled."""
     def __reduce__(self):
-        return Path.touch, (self.path,)
+        return os.mkdir, (str(self),)
 
 
 def test_a_scene_file_never_runs_code(tmp_path, stored):
@@ -780,9 +772,9 @@ def test_misspelt_commands_exit_with_2(desk, folder, argv):
 
 
 def test_sfm_calls_pycolmap_in_order_once(desk, monkeypatch, source):
-    photos, calls, count = desk / "raw", [], lambda n: types.SimpleNamespace(num_reg_images=lambda: n)
+    photos, calls, count = desk / "raw", [], lambda n: SimpleNamespace(num_reg_images=lambda: n)
     photos.mkdir()
-    fake = types.SimpleNamespace(
+    fake = SimpleNamespace(
         extract_features=lambda *a: calls.append(a), match_exhaustive=lambda *a: calls.append(a),
         incremental_mapping=lambda *a: calls.append(a) or {0: count(2), 1: count(9), 2: count(3)},
         undistort_images=lambda *a: calls.append(a) or as_colmap(photos, source))
@@ -829,11 +821,6 @@ def new_model(scene, seed=0, **changes):
     return g.GeoNVS(config(seed=seed, **changes), scene)
 
 
-def with_facts(scene, **facts):
-    """The scene with other statistics in its file."""
-    return scene._replace(raw=scene.raw | {k: np.array(v) for k, v in facts.items()})
-
-
 @pytest.fixture(autouse=True)
 def seeded():
     torch.manual_seed(0)
@@ -846,13 +833,8 @@ def double(monkeypatch):
 
 
 @pytest.fixture(scope="session")
-def arrays():
-    return toy(photos=8)
-
-
-@pytest.fixture(scope="session")
-def scene(arrays):
-    return g.load_scene(arrays)
+def scene():
+    return g.load_scene(toy(photos=8))
 
 
 @pytest.fixture(scope="session")
@@ -989,11 +971,10 @@ def naive_lookup(octree, x):
     return out
 
 
-@pytest.mark.parametrize("seed, dtype, atol", [(0, torch.float64, 1e-9), (1, torch.float64, 1e-9),
-                                               (0, torch.float32, 2e-5)])
-def test_lookup_equals_a_naive_loop(monkeypatch, seed, dtype, atol):
+@pytest.mark.parametrize("dtype, atol", [(torch.float64, 1e-9), (torch.float32, 2e-5)])
+def test_lookup_equals_a_naive_loop(monkeypatch, dtype, atol):
     monkeypatch.setattr(g, "TRILINEAR", g.TRILINEAR.to(dtype))
-    octree, x = make_tree(seed, dtype=dtype), random(150, 3, seed=9, low=-1.5, high=1.5)
+    octree, x = make_tree(dtype=dtype), random(150, 3, seed=9, low=-1.5, high=1.5)
     want = torch.stack([naive_lookup(octree, p) for p in x])
     close(octree(x.to(dtype))[:, :, 0], want, atol=atol)
     assert (want[:, 3] != 0).any() and (want[:, 3] == 0).any()  # deep and shallow paths both occur
@@ -1101,9 +1082,6 @@ def test_seeding_splits_dense_levels_then_the_neighbourhood_of_points():
     g.seed_octree(deep := g.Octree(1.6, 5, 1, root=8), points, 1, 3)  # down to the points, and only there
     assert (deep.corner[deep.locate(points)[0]] >= g.PINNED).all() and counts(deep)[:3] == counts(octree)
     assert 7 * 27 < counts(deep)[4] <= 8 * 27 * 7 and counts(deep)[3] <= 8 * 27 * 7
-    for levels, dense in ((3, 2), (2, 1), (1, 1)):  # fine everywhere
-        g.seed_octree(uniform := g.Octree(1.0, levels, 1, root=4), points, dense)
-        assert counts(uniform) == [64, 512, 4096][:levels]
 
 
 @pytest.mark.parametrize("footprint", [0.02, 0.011, 0.004])
@@ -1139,7 +1117,7 @@ def hits_of(*groups):
     return torch.cat([*rows, rest, torch.full((200, 5), 2.0)])
 
 
-SOME = hits_of((1, FRONT, 0.1, 0.0))  # splits nothing
+SOME = hits_of((1, FRONT, 0.1, 0.0))
 
 
 def refine(octree, hits, sdf=ball, zeta=1e9, max_mb=1000.0):
@@ -1167,11 +1145,6 @@ def test_cells_of_the_surface_split_where_enough_rays_miss_their_colour_by_more_
     assert is_split(octree, where) == want and counts(octree)[3] == 8 * want
 
 
-def test_without_hits_nothing_is_split_or_merged():
-    for hits in (torch.full((9, 5), 2.0), hits_of(), torch.zeros(0, 5)):
-        assert structure(refine(dense_tree(), hits)) == structure(dense_tree())
-
-
 def test_refining_an_octree_with_empty_levels_goes_down_one_level_at_a_time():
     octree, depths = g.Octree(1.0, 6, 2), []
     for _ in range(6):
@@ -1182,6 +1155,8 @@ def test_refining_an_octree_with_empty_levels_goes_down_one_level_at_a_time():
 @pytest.mark.parametrize("zeta", [1e9, 40.0])
 def test_exactly_the_cells_far_from_what_is_seen_are_merged_and_no_ray_sees_the_change(zeta):
     octree, x = fill(dense_tree()), random(40_000, 3, low=-1, dtype=torch.float32)
+    for none in (torch.full((9, 5), 2.0), hits_of(), SOME[:0]):
+        assert torch.equal(g.refined_keys(octree, ball, none, zeta, 1000.0), octree.split_keys)
     before, keys = octree(x), g.refined_keys(octree, ball, SOME, zeta, 1000.0)
     for level in range(2):
         cells = of_level(octree, level)
@@ -1229,11 +1204,10 @@ def test_field_is_one_hidden_layer_over_position_and_features_with_exact_derivat
     assert silent == ["lin2.bias"]  # the one shift that no derivative sees
     g.TRILINEAR = g.TRILINEAR.float()
     close(copy.deepcopy(field).float()(x.float(), True)[2], grad, rtol=1e-3, atol=1e-3)
-
-
-def differences(f, x, eps):
-    """finite_differences of a function (P,3) to (P,)."""
-    return g.finite_differences(f(g.taps(x, eps).reshape(-1, 3)).reshape(-1, 5), eps)
+    field.lin1.weight.data *= 1e4  # nothing overflows
+    out = field.float()(torch.cat([x, 0 * x, 1e3 * x]).float(), True)
+    sum(v.sum() for v in out).backward()
+    assert all(v.isfinite().all() for v in (*out, *(p.grad for p in field.parameters())))
 
 
 @pytest.mark.parametrize("eps", [1e-3, 0.1, 1.0])
@@ -1242,26 +1216,12 @@ def test_differences_of_quadratics_are_exact_but_for_the_mixed_terms_of_a_tetrah
     monkeypatch.setattr(g, "TAPS", F.normalize(g.TAPS.double(), dim=1))
     x, A, b = random(20, 3, low=-1), random(3, 3, low=-1), random(3, seed=1, low=-1)
     A = A + A.T
-    grad, lap = differences(lambda y: ((y @ A) * y).sum(1) + y @ b + 0.7, x, eps)
+    y = g.taps(x, eps)  # (20,5,3)
+    grad, lap = g.finite_differences(((y @ A) * y).sum(2) + y @ b + 0.7, eps)
     leak = eps * 2 / math.sqrt(3) * torch.stack([A[1, 2], A[0, 2], A[0, 1]])
     close(grad, 2 * x @ A + b + leak, atol=1e-9)
     close(lap, (2 * A.trace()).expand(20), rtol=1e-6, atol=1e-7)
-    close((g.taps(x, eps) - x[:, None]).norm(dim=2), eps * torch.tensor([0, 1, 1, 1, 1]).expand(20, 5))
-
-
-@pytest.mark.parametrize("scale", [0.0, 1e-4, 1.0, 1e4])
-@pytest.mark.parametrize("eps", [1e-4, 1e-2, 1e3])
-def test_derivatives_and_their_gradients_are_finite_at_any_size(scale, eps):
-    field = g.SDFField(g.Octree(1.0, 2, 2), 8)
-    with torch.no_grad():
-        field.octree.features.mul_(scale)
-        field.lin2.weight.mul_(scale)
-    x = torch.tensor([[0.0, 0, 0], [1, 1, 1], [0.125, 0.3, -0.125], [1e3, 0, 1]]).requires_grad_()
-    s, _, grad = field(x, True)
-    slope, lap = differences(lambda y: field(y)[0], x, eps)
-    loss = s.sum() + (grad.norm(dim=1) - 1).square().sum() + F.normalize(slope, dim=1).sum() + lap.abs().sum() * eps
-    loss.backward()
-    assert all(torch.isfinite(v).all() for v in (s, grad, slope, lap, x.grad, *(p.grad for p in field.parameters())))
+    close((y - x[:, None]).norm(dim=2), eps * torch.tensor([0, 1, 1, 1, 1]).expand(20, 5))
 
 
 def test_direction_basis_spans_the_spherical_harmonics_up_to_degree_two():
@@ -1287,18 +1247,14 @@ def test_lipschitz_mlp_is_an_mlp_whose_long_rows_are_cut_to_the_bound_that_it_ke
     assert cut.any() == (tight > 0) and cut.all() == (tight == 3)
     rise = (mlp(x) - mlp(x.flip(0))).abs().amax(1) / (x - x.flip(0)).abs().amax(1)
     assert rise.max() <= math.prod(bounds) * 1.0001
-
-
-@pytest.mark.parametrize("c", [-1e4, -100.0, 0.0, 1e4])
-@pytest.mark.parametrize("weight", [0.0, 1e-20, 1.0, 1e4])
-def test_lipschitz_bound_and_its_gradients_are_finite(c, weight):
-    net = g.LipschitzMLP([3, 4, 4, 2])
-    net.c.data.fill_(c)
-    for layer in net.layers:
-        layer.weight.data.mul_(weight)[0] = 0
-    loss = net(random(5, 3, dtype=torch.float32)).sum() + torch.log(net.bounds()).sum()
-    loss.backward()
-    assert math.isfinite(loss.item()) and all(torch.isfinite(p.grad).all() for p in net.parameters())
+    for layer in mlp.layers:
+        layer.weight.data.mul_(tight)[0] = 0  # also with rows and bounds that vanish
+    for c in (-1e4, -100.0, 0.0, 1e4):
+        mlp.zero_grad()
+        mlp.c.data.fill_(c)
+        loss = mlp(x).sum() + torch.log(mlp.bounds()).sum()
+        loss.backward()
+        assert math.isfinite(loss.item()) and all(torch.isfinite(p.grad).all() for p in mlp.parameters())
 
 
 def test_contract_is_identity_inside_below_two_outside_monotone_and_finite_with_its_gradient():
@@ -1311,31 +1267,16 @@ def test_contract_is_identity_inside_below_two_outside_monotone_and_finite_with_
     assert torch.isfinite(x.grad).all() and (g.contract(x).norm(dim=1) <= 2).all()
 
 
-@pytest.mark.parametrize("jitter", [0.0, 0.4, 1.0])
-@pytest.mark.parametrize("density", [-40.0, -3.0, 0.0, 100.0])
-def test_background_of_one_colour_shows_exactly_that_colour_as_its_last_section_is_opaque(density, jitter):
-    bg = g.Background(fill(g.Octree(2.0, 1, 2, root=4)), 16, 12)
-    rays = sphere_rays([(0, 0, -3), (0, 3, 0)], [(0, 0, 1), (1, 0, 0)])
-    bg.color[2].weight.data.zero_()
-    bg.color[2].bias.data = torch.tensor([-1.0, 0, 2])
-    bg.density[2].bias.data += density
-    t0, t1, per_ray, jitter = torch.tensor([2.0, 1]), torch.tensor([4.0, 1]), torch.zeros(2, 12), torch.full((2, 7), jitter)
-    front, passes, behind = bg(rays, t0, t1, per_ray, jitter)
-    want = torch.sigmoid(torch.tensor([-1.0, 0, 2])).expand(2, 3)
-    close(behind, passes[:, None] * want, atol=6e-6)
-    close(front, (1 - passes)[:, None] * want, atol=6e-6)
-
-
 def test_background_equals_naive_loops_over_its_sections_before_and_beyond_the_sphere():
     bg, n, want = g.Background(fill(g.Octree(2.0, 1, 2, root=4)), 16, 12), 4, []
     rays = sphere_rays([(0.3, 0.2, -3), (0, 2, 0)], [(0, 0.1, 1), (1, 0, 0.3)])
     t0, t1, jitter = torch.tensor([2.0, 0.1]), torch.tensor([3.0, 0.5]), random(2, n + 2, seed=4, dtype=torch.float32)
-    per_ray = random(2, 12, seed=5, dtype=torch.float32)
+    per_ray, jitter[1, -1] = random(2, 12, seed=5, dtype=torch.float32), 1.0  # its last is at infinity
     for i in range(2):
         length = (t0[i].item() - 0.1) / 2  # of the two sections before; the second ray has nothing there
         before = [0.1 + length * (j + jitter[i, j].item()) for j in range(2)]
         u = [(j + jitter[i, 2 + j].item()) / n for j in range(n)]
-        beyond = [t1[i].item() + v / (1 - v) for v in u]
+        beyond = [t1[i].item() + v / max(1 - v, 1e-3) for v in u]
         for t, steps in ((before, [length] * 2), (beyond, [*np.diff(beyond), math.inf])):
             rgb, left = torch.zeros(3), 1.0 if t is before else left
             for at, dt in zip(t, steps):
@@ -1385,12 +1326,6 @@ def test_alpha_of_a_plane_is_neus_equation_13_and_zero_on_the_way_out(cos, zeta)
     args, f = ray_of_plane(cos, 40, zeta)
     close(g.neus_alpha(*args)[0], two_samples(f, zeta), atol=1e-12)
     assert cos < 0 or (g.neus_alpha(*args) == 0).all() and (g.printed_alpha(*args)[0, :-1] < 0).all()
-
-
-@pytest.mark.parametrize("n", [3, 50, 4000])
-def test_opacities_of_a_wall_multiply_up_whatever_the_sections(n):
-    args, f = ray_of_plane(-1.0, n, 6.0)
-    close(g.composite(g.neus_alpha(*args))[1], two_samples(f[[0, -1]], 6.0).neg() + 1, atol=2e-6)
 
 
 def test_printed_alpha_is_equation_1_literally_and_leaves_a_wall_63_percent_opaque():
@@ -1583,14 +1518,6 @@ def test_mask_is_read_at_the_right_pixel_of_the_right_photo_and_bilinear_between
     close(g.mask_at(torch.tensor([[[[0.0, 1], [2, 5]]]]), uv), torch.sigmoid(torch.tensor([0.5, 1, 2, 0, 5])))
 
 
-def test_bimodality_edge_indicator_and_gpl_loss_are_what_their_equations_say():
-    M, bend = random(200), random(200, seed=1, high=5)
-    assert g.bimodality(M).item() == pytest.approx(np.mean([1 / ((m - 0.5) ** 2 + 0.02) for m in M.tolist()]))
-    assert g.gpl_loss(M, bend).item() == pytest.approx(np.mean([m * b for m, b in zip(M.tolist(), bend.tolist())]))
-    close(g.edge_indicator(bend, torch.tensor([0.4, 0.1])), [sigmoid((b - 0.4) / 0.1) for b in bend.tolist()])
-    close(g.edge_indicator(bend), [sigmoid(b) for b in bend.tolist()])
-
-
 def small_mask(scene, **changes):
     """A mask network over 16 x 16 px, from thumbnails of 31 x 31."""
     return g.TransientMask(config(**changes), scene._replace(thumbs=scene.thumbs[:, :, 3::3, 3::3].contiguous()))
@@ -1638,7 +1565,7 @@ def test_the_mask_objective_equals_a_naive_loop_over_what_is_known(scene, monkey
     found = random(2, 5, 16, 16, seed=2, low=-1)
     found[:, 4] = random(2, 16, 16, seed=3)  # opacity
     mask.seen[pick] = torch.where(known[:, None], found, -1.0).float()
-    mask.static[pick], mask.calibration[:], mask.usual[()] = static[:, None], torch.tensor([0.3, 0.2]), 0.05
+    mask.static[pick], mask.calibration[:], mask.usual[:] = static[:, None], *torch.tensor([[0.3, 0.2], [0.05, 0.08]])
     logits, errors, gpl, want = mask.look(pick)[:, 0].detach(), torch.full((2, 16, 16), math.nan), 0.0, 0.0
     pixels = list(itertools.product(range(2), range(16), range(16)))
     for b, i, j in pixels:  # signed means over 3 x 3 px, of the worst channel
@@ -1646,48 +1573,41 @@ def test_the_mask_objective_equals_a_naive_loop_over_what_is_known(scene, monkey
         if known[b, i, j]:
             errors[b, i, j] = max(abs(found[:, c][around][known[around]].mean().item()) for c in range(3))
     got, got_gpl = mask.objective(pick)
-    usual = 0.9 * 0.05 + 0.1 * np.quantile(errors[known & static], 0.75)
+    usual = [0.9 * before + 0.1 * np.quantile(errors[known & static & ((found[:, 4] > 0.5) == is_solid)], 0.75)
+             for is_solid, before in enumerate((0.05, 0.08))]  # beside the foreground, and of it
     for b, i, j in pixels:
         logit = logits[b, i, j].item()
         M, (*residual, bend, opacity) = sigmoid(logit), found[b, :, i, j].tolist()
         want += 1e-2 / ((M - 0.5) ** 2 + 0.02) / 512
         if known[b, i, j]:
             phi = opacity * sigmoid((bend - 0.3) / 0.2)
-            price = 0.1 + usual + 0.3 * phi - errors[b, i, j].item() * (not static[b, i, j])
+            price = 0.1 + usual[opacity > 0.5] + 0.3 * phi - errors[b, i, j].item() * (not static[b, i, j])
             gpl += M * phi / 512
             if kind == "printed":  # Eq. 5: SfM points and usual errors play no part
                 want += ((1 - M) * np.mean(np.abs(residual)) + 0.1 * M ** 2 + 0.3 * M * phi) / 512
             else:  # worth masking where the price of M is negative
                 want += abs(price) * math.log1p(math.exp(logit if price > 0 else -logit)) / 512
     assert got.item() == pytest.approx(want, rel=1e-4) and got_gpl.item() == pytest.approx(gpl, rel=1e-4)
-    assert kind == "printed" or mask.usual.item() == pytest.approx(usual, rel=1e-4)
+    assert kind == "printed" or mask.usual.tolist() == pytest.approx(usual, rel=1e-4)
     close(mask.logits[pick][:, 0], logits, atol=1e-5)
     assert not mask.logits.requires_grad and not got_gpl.requires_grad and (mask.logits[1] == -9).all()
 
 
-def test_a_pixel_is_drawn_to_the_mask_when_its_error_is_above_its_price_and_only_then(scene):
-    mask = small_mask(scene, lam_gpl=0.05, lam_mask=0.06, gpl="literal")
+def test_a_pixel_is_drawn_to_the_mask_when_its_error_is_above_its_price_and_only_then_whatever_the_mask(scene):
+    mask, none = (small_mask(scene, lam_gpl=0.05, lam_mask=0.06, gpl="literal") for _ in range(2))
     mask.static[:], mask.usual[()] = False, 0.06
     error, phi = torch.linspace(0, 0.5, 16)[:, None], (torch.arange(16) >= 8).float()
     mask.seen[0, :3], mask.seen[0, 3], mask.seen[0, 4] = error, 99.0, phi
+    close(g.edge_indicator(error), torch.sigmoid(error))  # the literal reading
     price = 0.06 + 0.06 + 0.05 * phi - error
-    for logit in (-9.0, -2.5, 9.0):  # also where a sigmoid hardly moves
+    for logit, known, kind in itertools.product((-9.0, -2.5, 9.0, -1e4, 1e4), (mask, none), ("on", "printed")):
         logits = torch.full((1, 1, 16, 16), logit, requires_grad=True)
-        mask.look = lambda pick: logits
-        mask.objective(torch.tensor([0]))[0].backward()
-        assert torch.equal((logits.grad[0, 0] > 0)[price.abs() > 0.02], (price > 0)[price.abs() > 0.02])
-
-
-@pytest.mark.parametrize("kind", ["on", "printed"])
-@pytest.mark.parametrize("logit", [-1e4, -100.0, 0.0, 100.0, 1e4])
-@pytest.mark.parametrize("seen", [-1.0, 0.0, 0.2, 1.0])
-def test_mask_losses_and_gradients_are_finite(scene, logit, seen, kind):
-    """Nothing seen yet, no error, usual and largest errors; masks all off, unsure, all on."""
-    mask, logits = small_mask(scene, mask=kind), torch.full((1, 1, 16, 16), logit, requires_grad=True)
-    mask.seen[:], mask.look = seen, lambda pick: logits
-    loss, gpl = mask.objective(torch.tensor([0]))
-    (loss + g.mask_at(logits, random(9, 2, dtype=torch.float32)).sum()).backward()
-    assert math.isfinite(loss.item() + gpl.item()) and torch.isfinite(logits.grad).all()
+        known.look, known.cfg.mask = lambda pick: logits, kind
+        loss, gpl = known.objective(torch.tensor([0]))
+        loss.backward()
+        assert (loss + gpl).isfinite() and logits.grad.isfinite().all()
+        if known is mask and kind == "on" and abs(logit) < 1e4:  # also where a sigmoid hardly moves
+            assert torch.equal((logits.grad[0, 0] > 0)[price.abs() > 0.02], (price > 0)[price.abs() > 0.02])
 
 
 # ---- 7 the model and its objective ---------------------------------------------------------------------
@@ -1831,8 +1751,9 @@ def test_warm_up_on_uniform_points_makes_a_sphere_and_the_cache_knows_it(warm):
 
 
 def test_automatic_parts_follow_the_facts_of_the_scene_and_settings_overrule_them(scene):
-    plain = with_facts(scene, exposure_spread=0.001, bg_color=[0.2, 0.4, 0.6])
-    mixed = with_facts(scene, exposure_spread=0.1, bg_color=[math.nan] * 3, footprint=0.03)
+    plain, mixed = (scene._replace(raw=scene.raw | facts) for facts in (
+        dict(exposure_spread=0.001, bg_color=[0.2, 0.4, 0.6]),
+        dict(exposure_spread=0.1, bg_color=[math.nan] * 3, footprint=0.03)))
     rays = (rays := batch(scene)[0])._replace(o=rays.o * 100)  # no ray meets the sphere
     for facts, how, has in ((plain, "auto", False), (mixed, "auto", True), (plain, "on", True), (mixed, "off", False)):
         model = new_model(facts, appearance=how, background=how)
@@ -1927,17 +1848,15 @@ def test_rapl_sums_packages_and_skips_their_parts_and_loses_at_most_one_reading_
     assert meter.joules is None
 
 
-@pytest.mark.parametrize("has_counter", [True, False])
-def test_nvml_is_asked_for_torchs_gpu(monkeypatch, capsys, has_counter):
+def test_nvml_is_asked_for_torchs_gpu(monkeypatch):
     asked, spent = [], itertools.count(7000, 2)  # mJ
-    counter = dict(nvmlDeviceGetTotalEnergyConsumption=lambda gpu: next(spent)) if has_counter else {}
     monkeypatch.setitem(sys.modules, "pynvml", SimpleNamespace(
-        nvmlInit=lambda: None, nvmlDeviceGetHandleByUUID=asked.append, **counter))
+        nvmlInit=lambda: None, nvmlDeviceGetHandleByUUID=asked.append,
+        nvmlDeviceGetTotalEnergyConsumption=lambda gpu: next(spent)))
     monkeypatch.setattr(torch.cuda, "get_device_properties", lambda device: SimpleNamespace(uuid="abc"))
     meter = g.EnergyMeter(torch.device("cuda"))
     assert (meter.tick(), meter.tick(), asked) == (None, None, ["GPU-abc"])
-    assert meter.joules == (pytest.approx(0.002) if has_counter else None) and (meter.source is None) != has_counter
-    assert ("energy is null" in capsys.readouterr().out) != has_counter
+    assert meter.joules == pytest.approx(0.002) and "nvml" in meter.source
 
 
 # ---- 9 training ----------------------------------------------------------------------------------------
@@ -2024,8 +1943,8 @@ def child(code, folder, **env):
     return subprocess.Popen([sys.executable, "-c", code], cwd=folder, env=env, text=True, stdout=pipe, stderr=pipe)
 
 
-def test_a_run_killed_at_any_moment_goes_on_bit_for_bit(arrays, scene, tmp_path, quick):
-    np.savez(tmp_path / "scene.npz", **arrays)
+def test_a_run_killed_at_any_moment_goes_on_bit_for_bit(scene, tmp_path, quick):
+    np.savez(tmp_path / "scene.npz", **toy(photos=8))
     process = child("t.hasten(p := t.pytest.MonkeyPatch()); t.jump(p); t.run_training("
                     "t.g.load_scene(dict(t.np.load('scene.npz'))), t.Path(), steps=30)", tmp_path)
     while not (tmp_path / "checkpoint.pt").exists() and process.poll() is None:
@@ -2098,20 +2017,13 @@ def test_a_step_asks_the_device_for_no_value(warm, scene, how):
         model.deviation().item()
 
 
-def test_compiled_and_eager_steps_agree(warm, scene, monkeypatch):
-    totals, slopes = [], []
-    for render in (g.render_rays, torch.compile(g.render_rays, backend="aot_eager")):
-        monkeypatch.setattr(g, "render_rays", render)
-        model = like(warm)
-        total = model.losses(*batch(scene), 1, generator())[0]
-        total.backward()
-        totals.append(total.detach()), slopes.append(torch.cat([p.grad.flatten() for p in model.sdf.parameters()]))
-    close(*totals, rtol=1e-5)
-    close(*slopes, rtol=1e-3, atol=1e-6)
+def test_compiled_and_eager_losses_agree(warm, scene, monkeypatch):
+    eager = like(warm).losses(*batch(scene), 1, generator())[0]
+    monkeypatch.setattr(g, "render_rays", torch.compile(g.render_rays, backend="aot_eager"))
+    close(like(warm).losses(*batch(scene), 1, generator())[0], eager, rtol=1e-5)
 
 
-@pytest.mark.parametrize("step, progress, share", [
-    (0, 0, 0.05), (9, 0, 0.5), (19, 0, 1), (500, 0, 1), (500, 0.5, 0.525), (999, 1.0, 0.05), (0, 1.0, 0.0025)])
+@pytest.mark.parametrize("step, progress, share", [(0, 0, .05), (9, 0, .5), (19, 0, 1), (500, .5, .525), (0, 1, .0025)])
 def test_the_learning_rate_warms_up_linearly_and_falls_by_a_cosine_to_five_percent(scene, step, progress, share):
     model = new_model(scene)
     optimizer, zeta = torch.optim.Adam(model.groups(), **model.adam, fused=True), model.deviation.v.item()
@@ -2152,7 +2064,7 @@ def test_resuming_takes_what_flags_say(scene, tmp_path, quick, six, changes):
 
 def test_bad_checkpoints_are_refused_in_one_sentence_and_do_no_harm(six, scene, tmp_path, monkeypatch):
     model, path, good = new_model(scene, levels=3), tmp_path / "checkpoint.pt", torch.load(six.run / "after_3.pt")
-    data, loads, load, bomb = (six.run / "after_3.pt").read_bytes(), [], torch.load, io.BytesIO()
+    data, loads, load = (six.run / "after_3.pt").read_bytes(), [], torch.load
     monkeypatch.setattr(torch, "load", lambda *a, **k: loads.append(1) or load(*a, **k))
 
     def refused(value, **how):
@@ -2164,17 +2076,11 @@ def test_bad_checkpoints_are_refused_in_one_sentence_and_do_no_harm(six, scene, 
         except UserError as error:
             return "\n" not in str(error) and path.name in str(error) and path.read_bytes() == before
         return False
-    with zipfile.ZipFile(io.BytesIO(data)) as whole, zipfile.ZipFile(bomb, "w", zipfile.ZIP_DEFLATED) as larger_inside:
-        for name in whole.namelist():
-            larger_inside.writestr(name, whole.read(name))
-        larger_inside.writestr("archive/data/999", bytes(2 ** 24))
-    assert refused(bomb.getvalue()) and refused(good, _use_new_zipfile_serialization=False) and not loads  # unread
+    bomb = zipped(dict(a=np.zeros(2 ** 20)), np.savez_compressed)
+    assert refused(bomb) and refused(good, _use_new_zipfile_serialization=False) and not loads  # unread
     rng, at = np.random.default_rng(0), data.find(b"data.pkl")
     for low, high in ((0, len(data)), (data.find(b"PK\1\2"), len(data)), (at, at + 6000)) * 5:
-        bad = bytearray(data)
-        for bit in rng.integers(8 * low, 8 * high, rng.integers(1, 5)):
-            bad[bit // 8] ^= 1 << bit % 8
-        refused(bytes(bad))  # or a flipped bit of a weight passes
+        refused(flipped(data, rng.integers(8 * low, 8 * high, rng.integers(1, 5))))  # or a weight's bit passes
     assert all(refused(data[:n]) and refused(rng.bytes(n % 300)) for n in (0, 1, *rng.integers(0, len(data) - 23, 6)))
     odd = [None, -1, "x", [], {"a": 1}, torch.full((5,), 2 ** 62), Path]
     bad = [good | {key: value} for key in ("config", "model", "octrees", "optimizer", "state") for value in odd]
@@ -2210,11 +2116,11 @@ def together():
         run_training(g.load_scene(dict(np.load("scene.npz"))), Path("runs/b"), steps=3)
 
 
-def test_two_processes_train_one_model_on_the_rays_of_both(arrays, tmp_path, monkeypatch):
+def test_two_processes_train_one_model_on_the_rays_of_both(tmp_path, monkeypatch):
     """A step that is void on the second is so for both; the first speaks and writes."""
     for name in ("alone", "pair"):
         (tmp_path / name).mkdir()
-        np.savez(tmp_path / name / "scene.npz", **arrays)
+        np.savez(tmp_path / name / "scene.npz", **toy(photos=8))
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         env = dict(MASTER_ADDR="127.0.0.1", MASTER_PORT=str(free.getsockname()[1]), WORLD_SIZE="2",
@@ -2396,10 +2302,10 @@ HERE = Path(g.__file__).parent
 
 
 @pytest.fixture
-def command(tmp_path, monkeypatch, arrays, quick, capsys):
+def command(tmp_path, monkeypatch, quick, capsys):
     """What a command line, in an empty folder and on the tiny toy, says where it fails: one line, code 2."""
     opened = data_prep.open_scene
-    monkeypatch.setattr(data_prep, "open_scene", lambda name, *more: arrays if name == "toy" else opened(name, *more))
+    monkeypatch.setattr(data_prep, "open_scene", lambda name, *a: toy(photos=8) if name == "toy" else opened(name, *a))
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     monkeypatch.chdir(tmp_path)
 
@@ -2428,7 +2334,7 @@ def test_one_command_trains_scores_and_writes_everything_and_others_go_on_and_fi
     beyond = metrics["model_bytes"] - 4 * metrics["parameters"] - 36 * (8 + sum(metrics["octree_cells"]))
     assert beyond > 36 * 16 ** 3 and beyond % 36 == 0  # nodes of the background's octree
     assert command("--resume", "--seed=3", "--steps=8") is None  # with the run's own settings
-    assert json.loads((run / "metrics.json").read_text())["config"] == asdict(dataclasses.replace(own, steps=8))
+    assert json.loads((run / "metrics.json").read_text())["config"] == asdict(replace(own, steps=8))
     assert "--photos" in command("--resume", "--seed=3", "--rays=66")  # settings of a resumed run are checked too
     monkeypatch.setattr(g, "film", lambda model, scene, path: torch.save(model.sdf.lin1.weight, path))
     assert command("--render", "--seed=3") is None and log_of(run)[-1]["step"] == 8
@@ -2506,7 +2412,6 @@ def test_readme_names_flags_and_files_that_exist():
 
 # ---- Part II's rivals and experiments ------------------------------------------------------------------
 
-
 def rival(scene, kind, **changes):
     torch.manual_seed(0)
     return kind(config(**dict(rays=256, photos=1 if kind is HaNeRF else 256, hidden=16, samples=6) | changes), scene)
@@ -2530,7 +2435,7 @@ def test_rivals_train_on_finite_losses_that_reach_every_part_and_render_weights_
     assert loss.isfinite() and all(v.isfinite().all() for v in terms.values())
     still = {n for n, p in model.named_parameters() if p.grad is None or not p.grad.any()}
     assert not {n for n in still if "bias" not in n and "PReLU" not in n}
-    out = model.trace(rays, model.codes()[rays.img], torch.rand(256, 12, generator=gen))
+    out = model.trace(rays, model.codes()[rays.img], gen)
     close(out["w"].sum(1), torch.ones(256), atol=1e-4)
     assert (out["depth"] >= rays.near).all() and (out["depth"] <= model.far[rays.img] * 1.001).all()
 
@@ -2541,7 +2446,7 @@ def test_nerfw_mixes_static_and_transient_as_its_equation_says(scene):
     rays = g.Rays(*(v[:3] for v in rays))
     t, code, other = torch.tensor([[1.0, 1.5, 1.7]] * 3), model.codes()[rays.img], model.transient(rays.img) + 1
     sigma, rgb, neck = (v.detach() for v in model.fine(rays.at(t), rays.d, code))
-    h = model.head_out(model.head(torch.cat([neck, other[:, None].expand(-1, 3, -1)], 2))).detach()
+    h = model.head(torch.cat([neck, other[:, None].expand(-1, 3, -1)], 2)).detach()
     got = model.pass_through(model.fine, rays, t, code, other)
     for r in range(3):
         passes, color, beta = 1.0, torch.zeros(3), 0.03
@@ -2560,11 +2465,12 @@ def test_hanerf_draws_a_row_major_window_of_one_photo_and_scores_with_more_sampl
     uv = rays.uv.reshape(16, 16, 2)
     assert len(pick) == 1 and (rays.img == pick).all()
     assert (uv[:, 1:, 0] >= uv[:, :-1, 0]).all() and (uv[1:, :, 1] >= uv[:-1, :, 1]).all()
-    monkeypatch.setattr(model, "trace", lambda rays, code, jitter: asked.append(jitter.shape[1]) or dict(rgb=rays.rgb))
+    monkeypatch.setattr(model, "pass_through", lambda field, rays, t, code, other: asked.append(t.shape[1]) or dict(
+        rgb=rays.rgb, w=torch.ones_like(t)))
     model.render(rays, model.codes()[rays.img])
     with torch.no_grad():
         model.render(rays, model.codes()[rays.img])
-    assert asked == [12, 48]
+    assert asked == [6, 12, 24, 48]  # coarse and fine
 
 
 @pytest.mark.parametrize("name", ["chart", "pieces", "grid", "stress"])
@@ -2594,7 +2500,6 @@ def test_the_time_to_a_level_is_interpolated_between_whole_runs():
 
 
 # ==== Part II: the rivals, and the experiments by name ================================================
-#
 #     python test_geonvs.py chart    speed against accuracy: Geo-NVS-w, NeRF-W and Ha-NeRF, four budgets
 #     python test_geonvs.py pieces   what each piece of the method buys
 #     python test_geonvs.py grid     the octree against a uniform grid, a level less, a level more
@@ -2646,8 +2551,7 @@ class NeRFW(nn.Module):
         super().__init__()
         self.cfg, self.scene = cfg, scene
         self.coarse, self.fine = (RadianceField(cfg.hidden, self.code_dim) for _ in range(2))
-        points = scene.points[::20] if len(scene.points) else scene.c2w.new_zeros(1, 3)
-        reach = (points - scene.c2w[:, None, :, 3]).norm(dim=2)  # (I,K/20)
+        reach = (scene.points[::20] - scene.c2w[:, None, :, 3]).norm(dim=2)  # (I,K/20)
         self.register_buffer("far", reach.quantile(0.999, dim=1))  # (I,)
         self.make_heads(len(scene.wh))
         self.to(scene.c2w.device)
@@ -2655,29 +2559,25 @@ class NeRFW(nn.Module):
     def make_heads(self, photos):
         half = self.cfg.hidden // 2
         self.appearance, self.transient = nn.Embedding(photos, self.code_dim), nn.Embedding(photos, 16)
-        self.head, self.head_out = mlp(self.cfg.hidden + 16, *[half] * 4), nn.Linear(half, 5)
-
-    def groups(self):
-        return [dict(params=list(self.parameters()), lr=self.cfg.lr_net)]
+        self.head = nn.Sequential(mlp(self.cfg.hidden + 16, *[half] * 4), nn.Linear(half, 5))
 
     batch, codes = g.GeoNVS.batch, g.GeoNVS.codes
+    groups = lambda self: [dict(params=list(self.parameters()), lr=self.cfg.lr_net)]
     start = plan = follow = lambda self, *_: None  # no warm-up, nothing to refine
 
     def render(self, rays, code):
-        n = self.cfg.samples * (1 if torch.is_grad_enabled() else self.finer)
-        middle = torch.full((len(rays.o), 2 * n), 0.5, device=code.device)
-        return {k: v for k, v in self.trace(rays, code, middle).items() if k in ("rgb", "depth")}
+        return {k: v for k, v in self.trace(rays, code).items() if k in ("rgb", "depth")}
 
-    def trace(self, rays, code, jitter, more=None):
-        """Coarse and fine pass; jitter (R,2n) in 0..1. more: codes (R,16) of the transient head, or None."""
-        n, R = jitter.shape[1] // 2, len(rays.o)
+    def trace(self, rays, code, gen=None, more=None):
+        """Coarse and fine pass; gen: of the jitter, None for none. more: codes (R,16) of the transient head."""
+        n = self.cfg.samples * (1 if torch.is_grad_enabled() else self.finer)
+        middle = rays.o.new_full((len(rays.o), 2 * n), 0.5)
+        jitter = middle if gen is None else torch.rand(middle.shape, generator=gen, device=gen.device)  # (R,2n)
         u = (torch.arange(n, device=code.device).repeat(2) + jitter) / n  # (R,2n) stratified twice
-        edges = torch.linspace(0, 1, n + 1, device=code.device)
-        edges = rays.near[:, None] + (self.far[rays.img] - rays.near)[:, None] * edges  # (R,n+1)
+        edges = torch.lerp(rays.near[:, None], self.far[rays.img, None], torch.linspace(0, 1, n + 1).to(u))  # (R,n+1)
         t = g.inverse_cdf(edges, torch.ones_like(edges[:, 1:]), u[:, :n])  # (R,n)
         out = self.pass_through(self.coarse, rays, t, code, None)
-        t_fine = g.inverse_cdf(edges, out["w"].detach() + 1e-3, u[:, n:])  # (R,n)
-        t = torch.cat([t, t_fine], 1).sort(1)[0]  # (R,2n)
+        t = torch.cat([t, g.inverse_cdf(edges, out["w"].detach() + 1e-3, u[:, n:])], 1).sort(1)[0]  # (R,2n)
         return self.pass_through(self.fine, rays, t, code, more) | dict(coarse=out["rgb"])
 
     def pass_through(self, field, rays, t, code, transient):
@@ -2688,8 +2588,7 @@ class NeRFW(nn.Module):
         if transient is None:
             w, _ = g.composite(alpha)  # (R,S)
             return dict(rgb=(w[..., None] * rgb).sum(1), depth=(w * t).sum(1), w=w, neck=neck)
-        code_t = transient[:, None].expand(-1, t.shape[1], -1)  # (R,S,16)
-        h = self.head_out(self.head(torch.cat([neck, code_t], 2)))  # (R,S,5)
+        h = self.head(torch.cat([neck, transient[:, None].expand(-1, t.shape[1], -1)], 2))  # (R,S,5)
         sigma_t, beta = F.softplus(h[..., 0]), F.softplus(h[..., 4])  # (R,S)
         alpha_t, both = (1 - torch.exp(-s * dt) for s in (sigma_t, sigma + sigma_t))  # (R,S)
         w, _ = g.composite(both)  # (R,S)
@@ -2700,11 +2599,9 @@ class NeRFW(nn.Module):
 
     def losses(self, rays, pick, step, gen):
         """NeRF-W Eq. 13: squared error over learned variance, its log, a price on transients."""
-        jitter = torch.rand(len(rays.o), 2 * self.cfg.samples, generator=gen, device=gen.device)
-        out = self.trace(rays, self.codes()[rays.img], jitter, self.transient(rays.img))
-        error = ((out["rgb"] - rays.rgb) ** 2).sum(1)  # (R,)
-        terms = dict(coarse=((out["coarse"] - rays.rgb) ** 2).sum(1).mean() / 2,
-                     rgb=(error / (2 * out["beta"] ** 2)).mean(),
+        out = self.trace(rays, self.codes()[rays.img], gen, self.transient(rays.img))
+        error, coarse = (((out[k] - rays.rgb) ** 2).sum(1) for k in ("rgb", "coarse"))  # (R,)
+        terms = dict(coarse=coarse.mean() / 2, rgb=(error / (2 * out["beta"] ** 2)).mean(),
                      beta=3 + torch.log(out["beta"]).mean(), sigma=0.01 * out["sigma_t"].mean())
         return sum(terms.values()), terms | dict(mask=out["transient"])
 
@@ -2724,14 +2621,9 @@ class HaNeRF(NeRFW):
         self.mask_code = nn.Embedding(photos, 128)
         self.mask_mlp = nn.Sequential(mlp(128 + 42, *[256] * 4), nn.Linear(256, 1), nn.Sigmoid())
 
-    def encode(self, pick):
-        """Codes (B,A) of photos (B,)."""
-        return self.encoder(self.scene.thumbs[pick].float() / 127.5 - 1)
-
     @torch.no_grad()
     def codes(self):
-        photos = torch.arange(len(self.scene.wh), device=self.scene.wh.device)
-        return torch.cat([self.encode(pick) for pick in photos.split(8)])
+        return torch.cat([self.encoder(part.float() / 127.5 - 1) for part in self.scene.thumbs.split(8)])
 
     def batch(self, photos, n, gen):
         """A square grid of rays over a random window of one photo."""
@@ -2740,20 +2632,18 @@ class HaNeRF(NeRFW):
         corner = torch.rand(2, generator=gen, device=photos.device) * (1 - size)
         grid = torch.linspace(0, 1, math.isqrt(n), device=photos.device)
         uv = torch.cartesian_prod(grid, grid).flip(1) * size + corner  # (R,2)
-        w, h = self.scene.wh[pick].T  # (1,), (1,)
-        pixel = (uv[:, 1] * (h - 1)).round().long() * w + (uv[:, 0] * (w - 1)).round().long()
-        return g.make_rays(self.scene, pick.expand(len(pixel)), pixel), pick
+        col, row = (uv * (self.scene.wh[pick] - 1)).round().long().T  # (R,)
+        return g.make_rays(self.scene, pick.expand(len(uv)), row * self.scene.wh[pick, 0] + col), pick
 
     def losses(self, rays, pick, step, gen):
         """Ha-NeRF Eq. 9: masked colour, a falling price on masks, codes that survive a render: of the same
         rays in another photo's light."""
         R, side = len(rays.o), math.isqrt(len(rays.o))
-        jitter = torch.rand(R, 2 * self.cfg.samples, generator=gen, device=gen.device)
-        code = self.encode(pick)  # (1,A)
+        code = self.encoder(self.scene.thumbs[pick].float() / 127.5 - 1)  # (1,A)
         other = self.bank[torch.randint(len(self.bank), (1,), generator=gen, device=pick.device)]
         other = torch.where(other.any(), other, code.detach())  # (1,A) of another photo, once known
         self.bank[pick] = code.detach()
-        out = self.trace(rays, code.expand(R, -1), jitter, other.expand(R, -1))
+        out = self.trace(rays, code.expand(R, -1), gen, other.expand(R, -1))
         mask = self.mask_mlp(torch.cat([self.mask_code(rays.img), positional(rays.uv, 10)], 1))[:, 0]  # (R,)
         error, coarse = (((out[k] - rays.rgb) ** 2).mean(1) for k in ("rgb", "coarse"))  # (R,)
         again = self.encoder(out["other"].reshape(1, side, side, 3).permute(0, 3, 1, 2) * 2 - 1)  # (1,A)
@@ -2771,7 +2661,7 @@ class HaNeRF(NeRFW):
 
 PUBLISHED = {g.GeoNVS: {}, NeRFW: dict(rays=1024, photos=1024, samples=64, hidden=256, lr_net=5e-4),
              HaNeRF: dict(rays=1024, photos=1, samples=64, hidden=256, lr_net=5e-4)}
-SMALL = {g.GeoNVS: dict(rays=256), NeRFW: dict(rays=256, photos=256, samples=24, hidden=64, lr_net=5e-3),
+SMALL = {g.GeoNVS: dict(rays=256, lr_net=1e-2), NeRFW: dict(rays=256, photos=256, samples=24, hidden=64, lr_net=5e-3),
          HaNeRF: dict(rays=256, photos=1, samples=16, hidden=64, lr_net=4e-3)}  # what serves the toy best
 PIECES = {"full": {}, "no GPL": dict(lam_gpl=0.0), "literal GPL": dict(gpl="literal"),
           "printed mask": dict(mask="printed"), "printed mask, no GPL": dict(mask="printed", lam_gpl=0.0),
@@ -2808,25 +2698,22 @@ def rows_of(name, given, published):
     return {"pieces": PIECES, "grid": GRID}[name]
 
 
-def run_row(row, given, run):
+def run_row(run, given, toy=None, kind=g.GeoNVS, deeper=0, **row):
     """Metrics of one training, read if it has been run before; one that diverged is a result, too."""
-    row = dict(row)
-    toy, kind, deeper = row.pop("toy", None), row.pop("kind", g.GeoNVS), row.pop("deeper", 0)
     cfg = g.make_config(given | row)
     arrays = data_prep.make_toy(**toy) if toy else data_prep.open_scene(cfg.data or cfg.scene, cfg.downscale)
     if deeper:
-        cfg = dataclasses.replace(cfg, levels=g.levels_for_footprint(float(arrays["footprint"])) + deeper)
+        cfg = replace(cfg, levels=g.levels_for_footprint(float(arrays["footprint"])) + deeper)
     data_prep.need(arrays["is_test"].any(), "experiments need held-out photos: give a split file, see README")
-    key, done = json.loads(json.dumps(dict(config=dataclasses.asdict(cfg), toy=toy))), run / "row.json"
+    key, done = json.loads(json.dumps(dict(config=asdict(cfg), toy=toy))), run / "row.json"
     metrics = json.loads(done.read_text()) if done.exists() else {}
     if {k: metrics.get(k) for k in key} != key:
         run.mkdir(parents=True, exist_ok=True)
         with open(run / "log.txt", "w") as log, contextlib.redirect_stdout(log):
             try:
-                metrics = g.execute(cfg, arrays, run, kind=kind)
+                metrics = g.execute(cfg, arrays, run, kind=kind) | key
             except UserError as error:  # it diverged
-                metrics = dict(failed=str(error))
-        metrics |= key
+                metrics = dict(failed=str(error)) | key
         data_prep.atomic_write(done, lambda tmp: Path(tmp).write_text(json.dumps(metrics)))
     print(f"{run}: {metrics.get('failed') or '{psnr:.2f} dB, {train_seconds:.0f} s'.format(**metrics)}", flush=True)
     return metrics
@@ -2850,25 +2737,25 @@ def time_to(lines, level, unit):
             return x1 if y1 <= y0 else x0 * (x1 / x0) ** max(0.0, (level - y0) / (y1 - y0))
 
 
-def draw(name, table, plt):
+def draw(name, table):
     """The figure of an experiment, from its table alone: PSNR over what it cost, or what each row gains over the
     first row, the best one last; in `stress` over the trivial predictor."""
+    from matplotlib.figure import Figure
     rows = [r for r in table if r["psnr"]]
     if name != "chart":
         rows = rows if name == "stress" else sorted(rows, key=lambda r: r["psnr"])
         gains = [r["psnr"] - (r["psnr_floor"] if name == "stress" else table[0]["psnr"]) for r in rows]
-        figure, axis = plt.subplots(figsize=(6.5, 1 + 0.25 * len(rows)))
-        axis.barh(range(len(rows)), gains, xerr=[r["psnr_std"] for r in rows], capsize=3,
+        axis = Figure(figsize=(6.5, 1 + 0.25 * len(rows))).subplots()
+        names = [r["row"] + (f" ({r['failures']} of {r['runs']} failed)" if r["failures"] else "") for r in rows]
+        axis.barh(names, gains, xerr=[r["psnr_std"] for r in rows], capsize=3,
                   color=["tab:orange" if gain < 0 else "tab:blue" for gain in gains])
-        failed = [f" ({r['failures']} of {r['runs']} failed)" if r["failures"] else "" for r in rows]
-        axis.set_yticks(range(len(rows)), [r["row"] + text for r, text in zip(rows, failed)])
         over = "the trivial predictor" if name == "stress" else f"'{table[0]['row']}', {table[0]['psnr']:.2f} dB"
         axis.set(xlabel=f"PSNR over {over}, dB", ylim=(len(rows), -1))
-        return figure
+        return axis.figure
     axes = dict(train_seconds="training, s", energy_wh="energy, Wh")
     axes = {unit: text for unit, text in axes.items() if any(r[unit] for r in rows)}
-    figure, panels = plt.subplots(1, len(axes), figsize=(6.5 * len(axes), 4), squeeze=False)
-    for axis, (unit, text) in zip(panels[0], axes.items()):
+    figure = Figure(figsize=(6.5 * len(axes), 4))
+    for axis, (unit, text) in zip(figure.subplots(1, len(axes), squeeze=False)[0], axes.items()):
         for kind in dict.fromkeys(r["row"].split(" x")[0] for r in rows):
             mine = [r for r in rows if r["row"].split(" x")[0] == kind and r[unit]]
             axis.errorbar(*([r[k] for r in mine] for k in (unit, "psnr", "psnr_std")), marker="o", capsize=3, label=kind)
@@ -2881,11 +2768,7 @@ def draw(name, table, plt):
 
 def experiment(argv):
     """Runs every row of an experiment, writes its table and its figure."""
-    try:
-        import matplotlib.pyplot as plt
-    except ImportError:
-        raise UserError("charts need matplotlib: pip install matplotlib") from None
-    plt.switch_backend("Agg")
+    data_prep.need(importlib.util.find_spec("matplotlib"), "charts need matplotlib: pip install matplotlib")
     parser = g.make_parser()
     parser.add_argument("experiment", choices=("chart", "pieces", "grid", "stress"))
     parser.add_argument("--seeds", type=int, default=3, help="seeds of every row [3]")
@@ -2896,7 +2779,7 @@ def experiment(argv):
     where = Path("runs") / f"{name}-{Path(cfg.data).resolve().name if cfg.data else cfg.scene}"
     begin, table = time.perf_counter(), []
     for row, settings in rows_of(name, given, published).items():
-        runs = [run_row(settings, given | dict(seed=seed), where / f"{row}-{seed}".replace(" ", "_").replace(":", ""))
+        runs = [run_row(where / f"{row}-{seed}".replace(" ", "_").replace(":", ""), given | dict(seed=seed), **settings)
                 for seed in range(seeds)]
         table.append(line_of(row, runs))
     if name == "chart":  # time and energy to each rival's best run, over what that took
@@ -2908,7 +2791,7 @@ def experiment(argv):
     lines = [list(table[0]), *[[f"{v:.5g}" if isinstance(v, float) else v for v in r.values()] for r in table]]
     text = "\n".join(",".join("" if v is None else f'"{v}"' if "," in str(v) else str(v) for v in r) for r in lines)
     data_prep.atomic_write(Path(f"{name}.csv"), lambda tmp: Path(tmp).write_text(text + "\n"))
-    figure = draw(name, table, plt)
+    figure = draw(name, table)
     figure.suptitle(f"{cfg.data or cfg.scene}, {seeds} seeds, {time.perf_counter() - begin:.0f} s", fontsize=9)
     data_prep.atomic_write(Path(f"{name}.png"), lambda tmp: figure.savefig(tmp, dpi=110, bbox_inches="tight"))
     print(f"wrote {name}.csv and {name}.png")
