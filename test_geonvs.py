@@ -1,5 +1,4 @@
-"""Part I: tests of data_prep.py, then of geonvs.py in the order of the file. Part II, after them: the rivals
-NeRF-W and Ha-NeRF and the experiments, run by name.
+"""Part I: tests, in the order of data_prep.py and geonvs.py. Part II: the rivals NeRF-W and Ha-NeRF, experiments.
 
 The tests come from properties: naive loops in float64, closed forms, limits, invariances, round trips; nothing
 needs data, network or a GPU, nothing is skipped, and no timing decides.
