@@ -97,7 +97,7 @@ class Config:
     lam_sfm: float = opt(0.3, "weight of |s(p)| at SfM points [D10]")
     lam_mask: float = opt(0.04, "weight of mean M: the excess error that masks a pixel [D7]")
     lr_grid: float = opt(1e-2, "learning rate of octree features and appearance codes")
-    lr_net: float = opt(4e-3, "learning rate of networks")
+    lr_net: float = opt(2e-3, "learning rate of networks")
     lr_zeta: float = opt(1e-3, "learning rate of the deviation network")
 
     def __post_init__(self):  # refuses what cannot work, before anything is written
