@@ -52,7 +52,8 @@ from torch import Tensor, nn
 import data_prep
 from data_prep import UserError, atomic_write, need, tell
 
-torch.set_float32_matmul_precision("highest")  # [D9] no TF32, which some containers switch on
+torch.set_float32_matmul_precision("highest")  # [D9] no TF32, which some containers switch on,
+torch.backends.cudnn.allow_tf32 = False  # and convolutions have by default
 
 
 # ---- 1 Config: every field is a flag -------------------------------------------------------------
@@ -108,6 +109,12 @@ class Config:
             need(is_right and value in (f.metadata["choices"] or [value]),
                  f"--{f.name} {value} makes no sense: use a number from {low}, or see --help")
         need(self.levels <= 9, "--levels goes up to 9: 4096 cells a side")
+        need(self.rays % self.photos == 0, "--rays must be a multiple of --photos")
+
+    @property
+    def source(self) -> str:
+        """What data_prep.open_scene takes: a scene's name, or a folder, never mistaken for one."""
+        return str(Path(self.data).resolve()) if self.data else self.scene
 
 
 # settings of photos on a GPU that differ from Config's defaults; flags override them
@@ -194,7 +201,7 @@ IS_SLOPE = F.pad(torch.eye(3), (1, 0)).repeat_interleave(8, 1) > 0  # (3,32)
 TRILINEAR = torch.stack([torch.where(IS_SLOPE, 2 * FAR - 1, 1 - FAR),  # (2,3,32) constant and
                          torch.where(IS_SLOPE, 0, 2 * FAR - 1)])  # factor of f
 PINNED = 64  # rows that stay zero, for hanging corners: on one row a GPU would queue their writes
-CHUNK = 4096  # points or rays evaluated at once outside training; of rays 4 times that on a GPU
+CHUNK = 4096  # points or rays evaluated at once without gradient; on a GPU 4 times as many rays
 resident = functools.cache(Tensor.to)  # a constant on a device: one copy, as copies make a GPU wait
 
 
@@ -319,7 +326,7 @@ def seed_octree(octree: Octree, points: Tensor, dense: int, near: int = 1) -> No
 
 
 def levels_for_footprint(footprint: float) -> int:
-    """Octree levels such that the finest cell is no smaller than a pixel at the surface."""
+    """Octree levels, 2 to 8: the finest cell is no smaller than a pixel at the surface."""
     return int(np.clip(1 + math.floor(math.log2(2 / footprint / 16)), 2, 8))
 
 
@@ -721,7 +728,7 @@ class TransientMask(nn.Module):
         sign, same optimum, a slope that never vanishes. Errors are signed means over 3x3 pixels, of
         the worst channel: what a blurred model lacks cancels, people do not. At pixels that show
         SfM points M saves nothing; their errors tell what is usual, and the price lies above it.
-        --mask printed has none of this: mean M^2 is the price of saved errors."""
+        --mask printed has none of this: as in Ha-NeRF, mean M^2 is the price."""
         cfg, logits, phi = self.cfg, self.look(pick), self.phi(pick)  # (B,1,m,m)
         self.logits[pick] = logits.detach()
         residual, known = self.seen[pick, :3], (self.seen[pick, 4:] >= 0).float()  # (B,3 or 1,m,m)
@@ -765,6 +772,9 @@ class GeoNVS(nn.Module):
         inside = scene.points.norm(dim=1) < 1
         self.sfm = scene.points[inside]  # (K,3)
         levels = cfg.levels or levels_for_footprint(float(raw["footprint"]))
+        held = 20 * 16 ** 3 * 8 ** levels / 2 ** 20  # MiB of a uniform grid, 140 bytes for a cell
+        need(cfg.grid == "octree" or held < cfg.max_mb, f"a uniform grid of {levels} levels takes "
+             f"{held:.0f} MiB: lower --levels or raise --max_mb")
         octree = Octree(1.0, levels, device=dev)
         seed_octree(octree, self.sfm, 1 if cfg.grid == "octree" else levels - 1)
         has_codes = dict(on=True, off=False, auto=raw["exposure_spread"] > 0.01)[cfg.appearance]
@@ -911,11 +921,12 @@ def open_counter(device: torch.device, rapl: str = "/sys/class/powercap"):
     if device.type == "cuda":
         import pynvml
         pynvml.nvmlInit()
-        used = range(RANKS) if RANKS > 1 else [device]  # the first process reads for all
+        used = range(RANKS) if RANKS > 1 else [device]  # the first process speaks for all
         uuids = [torch.cuda.get_device_properties(gpu).uuid for gpu in used]
         gpus = [pynvml.nvmlDeviceGetHandleByUUID(f"GPU-{uuid}") for uuid in uuids]
         return lambda: sum(map(pynvml.nvmlDeviceGetTotalEnergyConsumption, gpus)) / 1e3  # mJ
-    packages = [p for p in Path(rapl).glob("intel-rapl:*") if p.name.count(":") == 1]
+    packages = [p for p in Path(rapl).glob("intel-rapl:*")  # not their parts, nor the platform
+                if (p / "name").read_text().startswith("package")]
     need(packages, f"no counter in {rapl}")
     return lambda: sum(int((p / "energy_uj").read_text()) for p in packages) / 1e6
 
@@ -1001,8 +1012,8 @@ def read_checkpoint(path: Path, given: dict) -> tuple[dict, Config]:
         cfg = Config(**saved["config"])
         need(saved["state"]["step"] >= 0, "")
     except Exception as error:  # a damaged file can fail in any layer: zip, pickle, tensor storage
-        raise UserError(f"{path} is damaged or not a checkpoint of this program "
-                        f"({type(error).__name__}): delete it and train again") from None
+        raise UserError(f"{path} is damaged, too large for the memory or of another program "
+                        f"({type(error).__name__}): train again under another --name") from None
     return saved, replace(cfg, **given)
 
 
@@ -1179,7 +1190,7 @@ def evaluate(model, scene: Scene, lpips=None) -> dict:
     """Scores of the test photos by the half-image protocol [D12], per photo and on average, None
     where there are none; the first frames, (photo, name, frame), for the panel."""
     photos, rows, frames, means = scene.photos(True), [], [], {}  # (B,)
-    codes = fit_codes(model, scene, photos) if len(photos) else []  # (B,A)
+    codes = [code for some in photos.split(32) for code in fit_codes(model, scene, some)]  # B (A,)
     for i, code in tell(list(zip(photos.tolist(), codes)), "scoring held-out photos"):
         frame, name = render_photo(model, scene, i, code), str(scene.raw["name"][i])
         rows.append(dict(name=name) | score(frame, lpips))
@@ -1269,7 +1280,7 @@ def panel(model, frames: list[tuple[int, str, dict]], width: int = 240) -> np.nd
 def finish(model, scene: Scene, state: dict, run: Path) -> dict:
     """Scores a trained model and writes metrics.json, panel.png and mesh.ply below run."""
     cfg, is_gpu, octrees = model.cfg, scene.c2w.is_cuda, octrees_of(model)
-    peak = (torch.cuda.max_memory_allocated() if is_gpu else  # of training, not of scoring
+    peak = (torch.cuda.max_memory_allocated(scene.c2w.device) if is_gpu else  # before scoring
             resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
             * (1 if sys.platform == "darwin" else 1024))
     scores = evaluate(model, scene, make_lpips(scene.c2w.device))
@@ -1286,7 +1297,7 @@ def finish(model, scene: Scene, state: dict, run: Path) -> dict:
     git = ["git", "-C", Path(__file__).parent, "rev-parse", "--short", "HEAD"]
     metrics = dict(
         scene=scene.info["scene"], method=model.name, seed=cfg.seed, steps=state["step"],
-        device=(torch.cuda.get_device_name() if is_gpu else
+        device=(torch.cuda.get_device_name(scene.c2w.device) if is_gpu else
                 f"cpu, {torch.get_num_threads()} threads"), **scores,
         train_seconds=state["seconds"], dropped=state["dropped"],
         energy_wh=state["energy_wh"], energy_source=state["source"],
@@ -1387,12 +1398,13 @@ def main(argv: list[str] | None = None) -> None:
     given, saved = vars(make_parser().parse_args(argv)), None
     resume, render = (given.pop(k, False) for k in ("resume", "render"))
     cfg = make_config(given)
-    where = Path(cfg.data).resolve().name if cfg.data else cfg.scene
+    where = data_prep.scene_path(cfg.source).stem
     run = Path("runs") / (cfg.name or f"{where}-{GeoNVS.name}-{cfg.seed}")
     if resume or render:
+        given = {"minutes": 0.0} | given if "steps" in given else given  # of budgets the last one
         saved, cfg = read_checkpoint(run / "checkpoint.pt", given)
     need(cfg.rays % (cfg.photos * RANKS) == 0,
-         f"--rays {cfg.rays} must be a multiple of --photos {cfg.photos} times the processes")
+         f"--rays {cfg.rays} must be a multiple of --photos {cfg.photos} times {RANKS} processes")
     device = pick_device(cfg.device)
     if device.type == "cuda":
         torch.cuda.set_device(device)
@@ -1401,8 +1413,8 @@ def main(argv: list[str] | None = None) -> None:
                                 timeout=datetime.timedelta(days=1))  # the first scores alone
         sys.stdout = open(os.devnull, "w") if RANK else sys.stdout
     opened = functools.cache(data_prep.open_scene)
-    agreed(RANK or bool(opened(cfg.data or cfg.scene, cfg.downscale)))  # the first makes the file
-    arrays = opened(cfg.data or cfg.scene, cfg.downscale)
+    agreed(RANK or bool(opened(cfg.source, cfg.downscale)))  # the first makes the file
+    arrays = opened(cfg.source, cfg.downscale)
     if render:
         scene = load_scene(arrays, device)
         model = GeoNVS(cfg, scene)

@@ -632,17 +632,17 @@ def test_every_folder_has_a_file_of_its_own_and_a_toy_stays_as_it_was_made(desk,
     assert [str(p) for p in paths[:2]] == ["data/toy.npz", "data/sacre.npz"] and len(set(paths)) == len(paths)
     assert all(p.parent == Path("data") and p.suffix == ".npz" for p in paths) and paths[2].name.startswith("photos-")
     assert data_prep.scene_path(desk / "one/photos") == paths[2] == data_prep.scene_path("one/../one/photos")
-    as_colmap(desk / "a" / "toy", source)   # a folder called toy is no toy
-    assert info(data_prep.open_scene("a/toy"))["kind"] == "colmap"
     for name, command in (("sacre", "python data_prep.py sacre --download"), ("nowhere", "data_prep.py nowhere --sfm")):
         with pytest.raises(UserError, match=command):
             data_prep.open_scene(name)
-    made, _ = [], capsys.readouterr()
-    monkeypatch.setattr(data_prep, "make_toy", lambda **knobs: made.append(knobs) or toy())
-    assert same(data_prep.open_scene("toy", 7), toy()) and "making" in capsys.readouterr().out
-    data_prep.write_scene(paths[0], toy(seed=1))   # by data_prep.py toy --seed 1
+    made, small, other, _ = [], toy(), toy(seed=1), capsys.readouterr()
+    monkeypatch.setattr(data_prep, "make_toy", lambda **knobs: made.append(knobs) or small)
+    assert same(data_prep.open_scene("toy", 7), small) and "making" in capsys.readouterr().out
+    data_prep.write_scene(paths[0], other)   # by data_prep.py toy --seed 1
     (desk / "x.tsv").write_text("newer, and no business of the toy")
-    assert same(data_prep.open_scene("toy", 3), toy(seed=1)) and made == [{}] and not capsys.readouterr().out
+    assert same(data_prep.open_scene("toy", 3), other) and made == [{}] and not capsys.readouterr().out
+    as_colmap(desk / "toy", source)   # a folder called toy is no toy
+    assert info(data_prep.open_scene(g.Config(data="toy").source))["kind"] == "colmap"
 
 
 class Server(http.server.BaseHTTPRequestHandler):
@@ -773,8 +773,7 @@ def test_misspelt_commands_exit_with_2(desk, folder, argv):
 def test_sfm_calls_pycolmap_in_order_once(desk, monkeypatch, source):
     photos, calls, count = desk / "raw", [], lambda n: SimpleNamespace(num_reg_images=lambda: n)
     photos.mkdir()
-    fake = SimpleNamespace(
-        extract_features=lambda *a: calls.append(a), match_exhaustive=lambda *a: calls.append(a),
+    fake = SimpleNamespace(extract_features=lambda *a: calls.append(a), match_exhaustive=lambda *a: calls.append(a),
         incremental_mapping=lambda *a: calls.append(a) or {0: count(2), 1: count(9), 2: count(3)},
         undistort_images=lambda *a: calls.append(a) or as_colmap(photos, source))
     monkeypatch.setitem(sys.modules, "pycolmap", fake)
@@ -1836,13 +1835,13 @@ def test_rapl_sums_packages_and_skips_their_parts_and_loses_at_most_one_reading_
         g.open_counter(CPU, str(tmp_path))
     meter = g.EnergyMeter(CPU)
     for energies in ((900_000, 100_000, 5), (1_400_000, 150_000, 999_999), (100_000, 160_000, 9), (300_000, 160_000, 7)):
-        for name, energy in zip(("0", "1", "0:0"), energies):
-            (folder := tmp_path / f"intel-rapl:{name}").mkdir(exist_ok=True)
-            (folder / "energy_uj").write_text(f"{energy}\n")
+        for zone, name, energy in zip(("0", "1", "0:0", "2"), ("package-0", "package-1", "core", "psys"), (*energies, energies[0])):
+            (folder := tmp_path / f"intel-rapl:{zone}").mkdir(exist_ok=True)
+            (folder / "energy_uj").write_text(f"{energy}\n"), (folder / "name").write_text(f"{name}\n")
         meter.counter = meter.counter or g.open_counter(CPU, str(tmp_path))
         meter.tick()
     assert meter.joules == pytest.approx(0.55 + 0.2) and "rapl" in meter.source
-    (tmp_path / "intel-rapl:2").mkdir()  # its counter cannot be read: the sum would be wrong
+    (tmp_path / "intel-rapl:1/energy_uj").unlink()  # its counter cannot be read: the sum would be wrong
     assert meter.tick() is None and (meter := g.EnergyMeter(CPU, g.open_counter(CPU, str(tmp_path)))).tick() is None
     assert meter.joules is None
 
@@ -2334,9 +2333,10 @@ def test_one_command_trains_scores_and_writes_everything_and_others_go_on_and_fi
     assert beyond > 36 * 16 ** 3 and beyond % 36 == 0  # nodes of the background's octree
     assert command("--resume", "--seed=3", "--steps=8") is None  # with the run's own settings
     assert json.loads((run / "metrics.json").read_text())["config"] == asdict(replace(own, steps=8))
-    assert "--photos" in command("--resume", "--seed=3", "--rays=66")  # settings of a resumed run are checked too
+    assert command("--resume", "--seed=3", "--minutes=1e-9") is command("--resume", "--seed=3", "--steps=9") is None
+    assert "--photos" in command("--resume", "--seed=3", "--rays=66") and "mb" in command("--grid=uniform", "--levels=6")
     monkeypatch.setattr(g, "film", lambda model, scene, path: torch.save(model.sdf.lin1.weight, path))
-    assert command("--render", "--seed=3") is None and log_of(run)[-1]["step"] == 8
+    assert command("--render", "--seed=3") is None and log_of(run)[-1]["step"] == 9
     assert torch.equal(torch.load(run / "film.mp4"), checkpoint(run)["model"]["sdf.lin1.weight"])
 
 
@@ -2390,7 +2390,7 @@ def test_each_deviation_listed_is_tagged_and_each_setting_is_a_flag_and_used():
     assert len(listed) == len(set(listed)) > 10 and set(listed) == tagged
     text, terms = " ".join(g.make_parser().format_help().split()), {f"lam_{name}" for name in g.GeoNVS.terms}
     for name in (f.name for f in fields(g.Config)):
-        assert f"--{name} " in text and (name in terms or re.search(rf"\bcfg\.{name}\b", code)), name
+        assert f"--{name} " in text and (name in terms or re.search(rf"\b(?:cfg|self)\.{name}\b", code)), name
 
 
 def test_code_is_at_most_100_wide_and_python_3_10_can_read_it():
@@ -2700,7 +2700,7 @@ def rows_of(name, given, published):
 def run_row(run, given, toy=None, kind=g.GeoNVS, deeper=0, **row):
     """Metrics of one training, read if it has been run before; one that diverged is a result, too."""
     cfg = g.make_config(given | row)
-    arrays = data_prep.make_toy(**toy) if toy else data_prep.open_scene(cfg.data or cfg.scene, cfg.downscale)
+    arrays = data_prep.make_toy(**toy) if toy else data_prep.open_scene(cfg.source, cfg.downscale)
     if deeper:
         cfg = replace(cfg, levels=g.levels_for_footprint(float(arrays["footprint"])) + deeper)
     data_prep.need(arrays["is_test"].any(), "experiments need held-out photos: give a split file, see README")
@@ -2775,7 +2775,7 @@ def experiment(argv):
     given = vars(parser.parse_args(argv))
     name, seeds, published = (given.pop(k) for k in ("experiment", "seeds", "published"))
     cfg = g.make_config(given)
-    where = Path("runs") / f"{name}-{Path(cfg.data).resolve().name if cfg.data else cfg.scene}"
+    where = Path("runs") / f"{name}-{data_prep.scene_path(cfg.source).stem}"
     begin, table = time.perf_counter(), []
     for row, settings in rows_of(name, given, published).items():
         runs = [run_row(where / f"{row}-{seed}".replace(" ", "_").replace(":", ""), given | dict(seed=seed), **settings)
