@@ -532,14 +532,14 @@ def scene_path(name_or_folder):
 
 
 def open_scene(name_or_folder, downscale=2):
-    """Scene from its file: made on first use, and anew if sources or downscale change (no toy)."""
+    """Scene from its file: made on first use, and anew if its photos, poses or split changed."""
     path, is_toy, split = scene_path(name_or_folder), name_or_folder == "toy", None
     if path.exists():
         scene, made = read_scene(path), path.stat().st_mtime
         info = json.loads(str(scene["info"]))
         split, folder = info["split"], Path(info["folder"] or "")   # split: named once, by --split
         tables = [Path(split)] if split else folder.glob("[!.]*.tsv")
-        newer = (file for file in itertools.chain(tables, folder.glob("**/images.bin"))
+        newer = (file for file in itertools.chain(tables, folder.glob("**/images*"))
                  if file.exists() and file.stat().st_mtime > made)
         if is_toy or info["downscale"] == downscale and not any(newer):
             return scene

@@ -84,12 +84,12 @@ class Config:
     hidden: int = opt(64, "width of the MLPs")
     appearance_dim: int = opt(16, "length of a photo's appearance code")
     appearance: str = opt("auto", "codes; auto: on if exposures differ", "auto", "on", "off")
-    mask: str = opt("auto", "printed: paper's objective", "auto", "on", "off", "printed")
+    mask: str = opt("auto", "printed: without [D7] [D10]", "auto", "on", "off", "printed")
     background: str = opt("auto", "field; auto: off if it is one colour", "auto", "on", "off")
     normals: str = opt("analytic", "derivatives of the SDF [D13]", "analytic", "fd")
     sampling: str = opt("cached", "how samples are placed [D11]", "cached", "uniform")
     alpha: str = opt("neus", "opacity of a section [D1] [D2]", "neus", "printed")
-    gpl: str = opt("calibrated", "edge indicator Phi [D3]", "calibrated", "literal")
+    gpl: str = opt("calibrated", "the sigmoid of Phi [D3]", "calibrated", "literal")
     lam_eik: float = opt(0.04, "weight of the eikonal loss (Permuto-SDF)")
     lam_curv: float = opt(3e-3, "weight of the curvature loss, on |lap| eps [D4] [R]")
     lam_gpl: float = opt(0.05, "weight of the geometry-preservation loss (paper)")
@@ -722,7 +722,7 @@ class TransientMask(nn.Module):
         return opacity.clamp(min=0) * edge_indicator(bend, self.calibration)  # [D3]
 
     def objective(self, pick: Tensor) -> tuple[Tensor, Tensor]:
-        """The terms of Eq. 5 that hold M, over all pixels of photos (B,) that rays have seen, and
+        """The terms of Eq. 5 that hold M, over the pixels of photos (B,) that rays have seen, and
         L_GPL alone. [D14] M = 1 costs a pixel its price and saves it its error; as a sigmoid hardly
         moves at 0 or 1, their difference times M is minimised through its logistic surrogate: same
         sign, same optimum, a slope that never vanishes. Errors are signed means over 3x3 pixels, of
@@ -998,7 +998,7 @@ def save_checkpoint(path: Path, model, optimizer, gen, state: dict) -> None:
     torch.save(dict(config=asdict(model.cfg), model=model.state_dict(), rng=gen.get_state(),
                     optimizer=optimizer.state_dict(), state=state,
                     octrees=[o.split_keys for o in octrees_of(model)]), buffer)
-    atomic_write(path, lambda tmp: Path(tmp).write_bytes(buffer.getbuffer()))
+    atomic_write(path, lambda tmp: tmp.write_bytes(buffer.getbuffer()))
 
 
 def read_checkpoint(path: Path, given: dict) -> tuple[dict, Config]:
@@ -1255,7 +1255,7 @@ def write_ply(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
               *[f"property float {k}" for k in "xyz"], f"element face {len(f)}",
               "property list uchar int vertex_indices", "end_header\n")
     data = "\n".join(header).encode() + vertices.astype("<f4").tobytes() + f.tobytes()
-    atomic_write(path, lambda tmp: Path(tmp).write_bytes(data))
+    atomic_write(path, lambda tmp: tmp.write_bytes(data))
 
 
 def panel(model, frames: list[tuple[int, str, dict]], width: int = 240) -> np.ndarray:
@@ -1310,8 +1310,7 @@ def finish(model, scene: Scene, state: dict, run: Path) -> dict:
             git, capture_output=True, text=True).stdout.strip() or None)
     if scene.info["kind"] == "toy" and hasattr(model, "sdf"):
         metrics |= toy_truth(model, scene)
-    text = json.dumps(metrics, indent=1)
-    atomic_write(run / "metrics.json", lambda tmp: Path(tmp).write_text(text))
+    atomic_write(run / "metrics.json", lambda tmp: tmp.write_text(json.dumps(metrics, indent=1)))
     return metrics
 
 

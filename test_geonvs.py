@@ -595,17 +595,17 @@ age = lambda path, seconds: os.utime(path, (seconds, seconds))
 @pytest.mark.parametrize("name, home", [("place", "place"), ("sacre", "data/sacre"), ("sacre", "data/sacre_coeur")])
 def test_a_scene_is_made_once_and_anew_when_its_sources_change(desk, source, capsys, name, home):
     as_colmap(desk / home, source)
-    poses, table, path = desk / home / "dense/sparse/images.bin", desk / home / "toy.tsv", data_prep.scene_path(name)
+    photos, poses, table = (desk / home / part for part in ("dense/images", "dense/sparse/images.bin", "toy.tsv"))
 
     def makes(downscale=2):
         capsys.readouterr()
-        scene = data_prep.open_scene(name, downscale)
+        scene, path = data_prep.open_scene(name, downscale), data_prep.scene_path(name)
         assert np.array_equal(scene["wh"], source["wh"] // downscale) and same(scene, data_prep.read_scene(path))
         age(path, 2000)
         return capsys.readouterr().out.startswith(f"making {path}\n")
     assert makes()
-    for file, when, want in ((poses, 1000, True), (table, 1000, False), (poses, 3000, True), (poses, 2000, False),
-                             (table, 3000, True), (table, 2000, False)):
+    for file, when, want in ((photos, 0, True), (poses, 0, True), (table, 0, False), (poses, 3000, True), (poses, 0, False),
+                             (table, 3000, True), (table, 2000, False), (photos, 3000, True), (photos, 0, False)):
         age(file, when)
         assert makes() == want
     assert makes(4) and not makes(4) and makes()
@@ -615,7 +615,7 @@ def test_a_split_named_once_stays_when_the_scene_is_made_again(desk, folder, cap
     names, table = sorted(os.listdir(folder / "dense/images")), desk / "mine.tsv"   # not the folder's own
     table.write_text("filename\tsplit\n" + "".join(f"{n}\t{'test' if n == names[2] else 'train'}\n" for n in names))
     assert run_main(folder, "--split", "mine.tsv", "--downscale", 1)[0] == 0
-    age(folder / "dense/sparse/images.bin", 1000), age(folder / "toy.tsv", 9e9)
+    [age(folder / part, 1000) for part in ("dense/images", "dense/sparse/images.bin")], age(folder / "toy.tsv", 9e9)
     for downscale, when in ((1, 1000), (2, 1000), (2, 3000)):
         age(table, when)
         scene = data_prep.open_scene(folder, downscale)
