@@ -810,7 +810,7 @@ def close(a, b, rtol=1e-5, atol=1e-6):
 
 def batch(scene, n=64, photos=4, seed=0, among=None):
     """Rays and the photos they come from, of one step."""
-    model = SimpleNamespace(scene=scene, cfg=config(photos=photos))
+    model = SimpleNamespace(scene=scene, cfg=config(photos=photos, rays=n))
     return g.GeoNVS.batch(model, scene.photos(False) if among is None else torch.tensor(among), n, generator(seed))
 
 
@@ -2790,10 +2790,10 @@ def experiment(argv):
     lines = [list(table[0]), *[[f"{v:.5g}" if isinstance(v, float) else v for v in r.values()] for r in table]]
     text = "\n".join(",".join("" if v is None else f'"{v}"' if "," in str(v) else str(v) for v in r) for r in lines)
     data_prep.atomic_write(Path(f"{name}.csv"), lambda tmp: Path(tmp).write_text(text + "\n"))
-    figure = draw(name, table)
-    figure.suptitle(f"{cfg.data or cfg.scene}, {seeds} seeds, {time.perf_counter() - begin:.0f} s", fontsize=9)
+    figure, trained = draw(name, table), sum(r["train_seconds"] * r["runs"] for r in table if r["train_seconds"])
+    figure.suptitle(f"{cfg.data or cfg.scene}, {seeds} seeds, {trained / 60:.0f} minutes of training", fontsize=9)
     data_prep.atomic_write(Path(f"{name}.png"), lambda tmp: figure.savefig(tmp, dpi=110, bbox_inches="tight"))
-    print(f"wrote {name}.csv and {name}.png")
+    print(f"wrote {name}.csv and {name}.png after {time.perf_counter() - begin:.0f} s")
 
 
 if __name__ == "__main__":
