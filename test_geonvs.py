@@ -1698,7 +1698,7 @@ def test_only_lessons_teach_the_mask_and_every_eighth_step_the_cache(warm, scene
         (rays, pick), alone = batch(scene, seed=step), copy.deepcopy(model.mask)
         model.zero_grad()
         total, raw = model.losses(rays, pick, step, generator(step))
-        total.backward()
+        total.backward(), close(raw["mask"], g.mask_at(alone.logits[pick], rays.uv))
         is_taught, is_lesson, want = model.mask.cgnet.heads[0].bias.grad is not None, "gpl" in raw, objective(raw)
         if is_lesson:
             g.TransientMask.remember(alone, *told[-1])
@@ -2379,7 +2379,7 @@ def test_settings_come_from_defaults_then_the_scene_then_flags_and_devices_are_t
     assert g.make_config(dict(scene="taj", steps=9)) == g.Config(scene="taj", **g.LARGE | dict(steps=9))
     assert g.make_config(dict(data="x", device="cpu", rays=8)) == g.Config(data="x", device="cpu", rays=8)
     for refused, given, word in ((g.main, ["--rays=8", "--photos=8"], "processes"),
-                                 (g.pick_device, "cuda:2", "cuda:0, cuda:1")):
+                                 (lambda rays: g.Config(rays=rays), 9, "--photos"), (g.pick_device, "cuda:2", "cuda:1")):
         with pytest.raises(UserError, match=word):
             refused(given)
 
