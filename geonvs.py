@@ -22,10 +22,10 @@ Conventions
 Where the printed paper is departed from, the line carries its tag:
   [D1]  alpha is divided by sigmoid(zeta s_prev) and never negative (printed: a wall is 63 % opaque)
   [D2]  the slope correction sits inside zeta, with opposite signs for the two ends of a section
-  [D3]  Phi: NeuS-weighted errors, |lap| eps, calibrated by quantiles, detached, times opacity
+  [D3]  Phi: NeuS-weighted E_grad, |lap| eps, calibrated by quantiles, detached, times opacity
   [D4]  the curvature loss is |lap| times eps: |lap| of a trilinear field grows as eps shrinks
   [D5]  the Lipschitz term is a sum of logs, not a product that can drown the colour at first
-  [D6]  CGNet: GroupNorm, ReLU, half the width, negative first bias, head at half resolution
+  [D6]  CGNet: GroupNorm, ReLU, half the width, one block a stage, negative bias, finer head
   [D7]  the mask pays mean M, not mean M^2, to go with an L1 error, above what SfM pixels err by
   [D8]  the background also fills what lies before the sphere; its last section is opaque
   [D9]  all is float32: mixed precision, as the paper has it, makes noise of distances and normals
@@ -75,7 +75,7 @@ class Config:
     minutes: float = opt(0.0, "training budget in minutes, instead of --steps if above 0")
     downscale: int = opt(2, "integer factor by which photos are made smaller (benchmarks use 2)")
     rays: int = opt(512, "rays per step, of all processes together")
-    photos: int = opt(8, "photos per step; the mask network sees these whole")
+    photos: int = opt(8, "photos per step; a lesson of the mask shows them whole")
     samples: int = opt(16, "foreground samples per ray")
     bg_samples: int = opt(24, "background samples per ray, a third of them before the sphere")
     levels: int = opt(0, "octree levels, 0: from the pixel footprint at the surface")
@@ -84,14 +84,14 @@ class Config:
     hidden: int = opt(64, "width of the MLPs")
     appearance_dim: int = opt(16, "length of a photo's appearance code")
     appearance: str = opt("auto", "codes; auto: on if exposures differ", "auto", "on", "off")
-    mask: str = opt("auto", "printed: without [D7] [D10]", "auto", "on", "off", "printed")
+    mask: str = opt("auto", "printed: paid by M^2, as in Ha-NeRF", "auto", "on", "off", "printed")
     background: str = opt("auto", "field; auto: off if it is one colour", "auto", "on", "off")
     normals: str = opt("analytic", "derivatives of the SDF [D13]", "analytic", "fd")
     sampling: str = opt("cached", "how samples are placed [D11]", "cached", "uniform")
     alpha: str = opt("neus", "opacity of a section [D1] [D2]", "neus", "printed")
     gpl: str = opt("calibrated", "the sigmoid of Phi [D3]", "calibrated", "literal")
     lam_eik: float = opt(0.04, "weight of the eikonal loss (Permuto-SDF)")
-    lam_curv: float = opt(3e-3, "weight of the curvature loss, on |lap| eps [D4] [R]")
+    lam_curv: float = opt(3e-3, "weight of the curvature loss, on |lap| eps [D4]")
     lam_gpl: float = opt(0.05, "weight of the geometry-preservation loss (paper)")
     lam_lps: float = opt(1e-5, "weight of the Lipschitz loss, log form [D5] [R]")
     lam_off: float = opt(1e-3, "weight of the off-surface loss [R]")
@@ -473,7 +473,7 @@ class Background(nn.Module):
         sigma = F.softplus(density.reshape(R, S) - 1)[:, :-1]  # (R,S-1)
         dt = torch.cat([dt.expand(-1, n), torch.diff(beyond)], 1)  # (R,S-1)
         alpha = F.pad(-torch.expm1(-sigma * dt), (0, 1), value=1.0)  # (R,S) [D8]
-        w, _ = composite(alpha)  # (R,S)
+        w, _ = composite(alpha)  # (R,S), section 5
         front, behind = (w[:, :, None] * rgb).split([n, S - n], 1)
         return front.sum(1), 1 - w[:, :n].sum(1), behind.sum(1)  # (R,3), (R,), (R,3)
 
@@ -496,7 +496,8 @@ def neus_alpha(sdf: Tensor, cos: Tensor, dt: Tensor, zeta: Tensor) -> Tensor:
     s -+ cos dt / 2 inside zeta [D2], divided so that opacities multiply up to 1 behind walls [D1].
     A section that leads outwards (cos > 0) is transparent. Logs of sigmoids do not overflow."""
     half = F.relu(cos * (dt / -2))  # (R,S)
-    return -torch.expm1(F.logsigmoid(zeta * (sdf - half)) - F.logsigmoid(zeta * (sdf + half)))
+    before, after = F.logsigmoid(zeta * torch.stack([sdf + half, sdf - half]))  # (R,S)
+    return -torch.expm1(after - before)
 
 
 def printed_alpha(sdf: Tensor, cos: Tensor, dt: Tensor, zeta: Tensor) -> Tensor:
@@ -602,17 +603,18 @@ def render_rays(model: "GeoNVS", rays: Rays, code: Tensor, jitter: Tensor) -> di
 
 # ---- 6 Photos in the wild: transient mask and geometry preservation ------------------------------
 
-def conv(cin: int, cout: int, size: int = 3, stride: int = 1) -> nn.Sequential:
-    return nn.Sequential(nn.Conv2d(cin, cout, size, stride, size // 2, bias=False),
+def conv(cin: int, cout: int, stride: int) -> nn.Sequential:
+    return nn.Sequential(nn.Conv2d(cin, cout, 3, stride, 1, bias=False),
                          nn.GroupNorm(8, cout), nn.ReLU())  # [D6]
 
 
 class ContextBlock(nn.Module):
-    """Context-guided block (CGNet Fig. 3): local and dilated context, gated globally."""
-    def __init__(self, cin: int, cout: int, stride: int, dilation: int):
+    """Context-guided block (CGNet Fig. 3) at half the resolution: local and dilated context, gated
+    globally; no residual, no 1x1. [D6]"""
+    def __init__(self, cin: int, cout: int, dilation: int):
         super().__init__()
         half = cout // 2
-        self.reduce = conv(cin, half, 3 if stride == 2 else 1, stride)
+        self.reduce = conv(cin, half, 2)
         self.local = nn.Conv2d(half, half, 3, 1, 1, groups=half, bias=False)
         self.around = nn.Conv2d(half, half, 3, 1, dilation, dilation, half, bias=False)
         self.join = nn.Sequential(nn.GroupNorm(8, cout), nn.ReLU())
@@ -620,30 +622,26 @@ class ContextBlock(nn.Module):
                                   nn.Linear(cout // 8, cout), nn.Sigmoid())
 
     def forward(self, x: Tensor) -> Tensor:
-        y = self.reduce(x)  # (B,cout/2,h,w)
-        y = self.join(torch.cat([self.local(y), self.around(y)], 1))  # (B,cout,h,w)
-        y = y * self.gate(y.mean((2, 3)))[:, :, None, None]
-        return y + x if y.shape == x.shape else y
+        y = self.reduce(x)  # (B,cout/2,h/2,w/2)
+        y = self.join(torch.cat([self.local(y), self.around(y)], 1))  # (B,cout,h/2,w/2)
+        return y * self.gate(y.mean((2, 3)))[:, :, None, None]
 
 
 class CGNet(nn.Module):
     """Whole photos (B,3,H,W) in 0..1 to transient logits (B,1,H/2,W/2) (CGNet, as in CR-NeRF). [D6]
     The head reads all three resolutions: at 1/8 alone a mask could not follow an outline."""
-    def __init__(self, width: int = 16):
+    def __init__(self):
         super().__init__()
-        a, b, c = width, 2 * width, 4 * width
-        self.stages = nn.ModuleList([
-            nn.Sequential(conv(3, a, stride=2), conv(a, a)),
-            nn.Sequential(ContextBlock(a, b, 2, 2), ContextBlock(b, b, 1, 2)),
-            nn.Sequential(ContextBlock(b, c, 2, 4), ContextBlock(c, c, 1, 4))])
-        self.heads = nn.ModuleList(nn.Conv2d(k, 1, 1) for k in (a, b, c))
+        self.stages = nn.ModuleList([nn.Sequential(conv(3, 16, 2), conv(16, 16, 1)),
+                                     ContextBlock(16, 32, 2), ContextBlock(32, 64, 4)])
+        self.heads = nn.ModuleList(nn.Conv2d(k, 1, 1) for k in (16, 32, 64))
         for head, bias in zip(self.heads, (-2.5, 0.0, 0.0)):
             nn.init.constant_(head.bias, bias)  # starts with 8 % masked, not with half the picture
 
     def forward(self, photo: Tensor) -> Tensor:
         y, logits = photo - 0.5, []
         for stage, head in zip(self.stages, self.heads):
-            y = stage(y)  # (B,a,H/2,W/2), (B,b,H/4,W/4), (B,c,H/8,W/8)
+            y = stage(y)  # (B,16,H/2,W/2), (B,32,H/4,W/4), (B,64,H/8,W/8)
             logits.append(head(y))
         size = logits[0].shape[2:]
         return sum(F.interpolate(z, size, mode="bilinear") for z in logits)  # (B,1,H/2,W/2)
@@ -671,13 +669,8 @@ def gpl_loss(mask: Tensor, edge: Tensor) -> Tensor:
     return (mask * edge).mean()
 
 
-def bimodality(mask: Tensor) -> Tensor:
-    """The second half of L_reg: a pole at 1/2 that pushes M to 0 or 1 (Ha-NeRF's digit loss)."""
-    return (1 / ((mask - 0.5) ** 2 + 0.02)).mean()
-
-
-MASK_EVERY = 8  # steps from one lesson of the mask network to the next [D14]
-LAM_BIMODAL = 1e-4  # weight of bimodality beside mean M, above which masks freeze half-way
+MASK_EVERY = 4  # steps from one lesson of the mask network to the next [D14]
+LAM_BIMODAL = 1e-4  # weight of the pole at M = 1/2 beside mean M, above which masks freeze there
 
 
 class TransientMask(nn.Module):
@@ -690,12 +683,12 @@ class TransientMask(nn.Module):
         self.logits = nn.Buffer(torch.full((I, 1, m, m), -9.0))  # last output of the network
         self.seen = nn.Buffer(torch.full((I, 5, m, m), -1.0))  # residual, bend, opacity; -1: no ray
         self.calibration = nn.Buffer(torch.tensor([0.0, 1.0]))  # centre and width of Phi
-        self.usual = nn.Buffer(torch.full((2,), 0.3))  # running upper quartiles of errors at SfM
-        # points: of what is seen beside the foreground, where the model draws less well, and of it
+        # running upper quartiles of errors at SfM points: beside the foreground, and of it
+        self.usual = nn.Buffer(torch.full((2,), 0.3))
         static = torch.zeros(I, 1, m, m, dtype=torch.bool, device=scene.thumbs.device)
         ok = ((scene.track_uv >= 0) & (scene.track_uv < 1)).all(1)  # not those that SfM got wrong
         col, row = (scene.track_uv[ok] * m).long().unbind(1)  # (T,)
-        static[scene.track_photo[ok], 0, row, col] = True  # but for outlines scene [D10]
+        static[scene.track_photo[ok], 0, row, col] = True  # scene, but for some on outlines [D10]
         self.static = nn.Buffer(static)
 
     def look(self, pick: Tensor) -> Tensor:
@@ -733,19 +726,19 @@ class TransientMask(nn.Module):
         self.logits[pick] = logits.detach()
         residual, known = self.seen[pick, :3], (self.seen[pick, 4:] >= 0).float()  # (B,3 or 1,m,m)
         mask, static = logits.sigmoid(), self.static[pick]  # (B,1,m,m)
-        gpl, pole = gpl_loss(mask, phi), LAM_BIMODAL * bimodality(mask)
+        gpl = gpl_loss(mask, phi)
+        pole = LAM_BIMODAL * (1 / ((mask - 0.5) ** 2 + 0.02)).mean()  # to 0 or 1 (Ha-NeRF's digits)
         if cfg.mask == "printed":
             error = residual.abs().mean(1, keepdim=True)  # (B,1,m,m)
             paid = ((1 - mask) * error + cfg.lam_mask * mask ** 2) * known  # (B,1,m,m)
             return paid.mean() + pole + cfg.lam_gpl * gpl, gpl.detach()
         around = F.avg_pool2d(torch.cat([residual * known, known], 1), 3, 1, 1)  # (B,4,m,m)
         error = (around[:, :3] / around[:, 3:].clamp(min=0.1)).abs().amax(1, True)  # (B,1,m,m)
-        solid = (self.seen[pick, 4:] > 0.5).long()  # (B,1,m,m) 1: the foreground, 0: beside it
-        told = torch.where(static & (known > 0), error, math.nan)  # (B,1,m,m)
-        usual = torch.stack([torch.where(solid == i, told, math.nan).nanquantile(0.75)
-                             for i in (0, 1)])  # (2,)
+        solid = self.seen[pick, 4:] > 0.5  # (B,1,m,m) the foreground, or what is beside it
+        told = torch.stack([~solid, solid]) & static & (known > 0)  # (2,B,1,m,m) at SfM points
+        usual = torch.where(told, error, math.nan).flatten(1).nanquantile(0.75, 1)  # (2,)
         self.usual.lerp_(torch.where(usual.isnan(), self.usual, usual), 0.1)
-        price = cfg.lam_mask + self.usual[solid] + cfg.lam_gpl * phi  # (B,1,m,m) [D7]
+        price = cfg.lam_mask + self.usual[solid.long()] + cfg.lam_gpl * phi  # (B,1,m,m) [D7]
         price = price - error * ~static  # (B,1,m,m)
         slope = F.softplus(torch.where(price > 0, logits, -logits))  # (B,1,m,m)
         return (price.abs() * slope * known).mean() + pole, gpl.detach()
@@ -851,13 +844,13 @@ class GeoNVS(nn.Module):
         """n rays of one step and the photos (B,) they come from, drawn at random."""
         B, wh, dev = self.cfg.photos, self.scene.wh, photos.device
         pick = photos[torch.randint(len(photos), (B,), generator=gen, device=dev)]  # (B,)
-        img = pick.repeat_interleave(n // B)  # (R,) photo by photo, equally many from each
+        img = pick.repeat_interleave(max(n // B, 1))  # (R,) photo by photo, equally many from each
         u = torch.rand(len(img), generator=gen, device=dev, dtype=torch.float64)  # (R,)
         return make_rays(self.scene, img, (u * wh[img].prod(1)).long()), pick
 
     def groups(self) -> list[dict]:
-        """Optimiser groups: what is looked up fast, networks slower, mask and zeta apart: its eps
-        lets no vanishing gradient drive it away."""
+        """Optimiser groups: what is looked up fast, networks slower, mask and zeta apart: eps
+        lets no vanishing gradient drive zeta away."""
         tables = [self.appearance.weight, *(o.features for o in octrees_of(self))]
         mask = list(self.mask.parameters())
         taken = {id(p) for p in [*tables, *mask, self.deviation.v]}
@@ -957,7 +950,7 @@ class EnergyMeter:
 REFINE_AT = (0.1, 0.2, 0.3, 0.45, 0.6)  # shares of training at which the octree is refined
 PATIENCE = 20  # steps in a row without a finite loss and gradient that stop a run
 # torchrun starts RANKS processes. Each draws its own rays, the gradients are averaged, the first
-# process decides, speaks and writes; so all hold the same weights.
+# process decides, speaks and writes; so all hold the same weights, but each what its rays found.
 RANK, LOCAL_RANK, RANKS = (int(os.environ.get(name, default)) for name, default in (
     ("RANK", 0), ("LOCAL_RANK", 0), ("WORLD_SIZE", 1)))
 
@@ -994,7 +987,7 @@ def training_step(model, optimizer, photos: Tensor, state: dict, progress: float
 
 
 def save_checkpoint(path: Path, model, optimizer, gen, state: dict) -> None:
-    buffer = io.BytesIO()
+    buffer = io.BytesIO()  # as torch.save calls a full disk a RuntimeError
     torch.save(dict(config=asdict(model.cfg), model=model.state_dict(), rng=gen.get_state(),
                     optimizer=optimizer.state_dict(), state=state,
                     octrees=[o.split_keys for o in octrees_of(model)]), buffer)
@@ -1030,9 +1023,11 @@ def restore(saved: dict, path: Path, model, gen=None) -> torch.optim.Adam:
         if gen is not None:
             gen.set_state(saved["rng"])
         return optimizer
+    except torch.OutOfMemoryError:
+        raise
     except (LookupError, ValueError, RuntimeError, TypeError, AttributeError, UserError) as error:
         raise UserError(f"{path} does not fit this scene and these settings ({error!r:.90}): use "
-                        "the flags and the kind of device it was made with, or delete it") from None
+                        "flags and kind of device as it was made with, or another --name") from None
 
 
 def train(cfg: Config, scene: Scene, run: Path, saved: dict | None = None, kind=GeoNVS):
@@ -1082,7 +1077,7 @@ def train(cfg: Config, scene: Scene, run: Path, saved: dict | None = None, kind=
         dropped, streak = dropped + is_void, (streak + 1) * is_void
         if state["refined"] < len(REFINE_AT) and progress >= REFINE_AT[state["refined"]]:
             state["refined"] += 1
-            model.follow(agreed(model.plan(state["refined"] == len(REFINE_AT))), optimizer)
+            model.follow(agreed(RANK or model.plan(state["refined"] == len(REFINE_AT))), optimizer)
     need(not has_diverged, f"{int(streak)} steps in a row had no finite loss: mend poses, or try a "
          f"third of the learning rates --lr_grid, --lr_net; {path} holds the last good weights")
     return model, state
@@ -1099,7 +1094,7 @@ def report(model, path: Path, progress: float, state: dict, terms: dict) -> None
     line |= {k: v.mean().item() for k, v in (terms | more).items()}
     line["psnr"] = psnr(out["rgb"], rays.rgb)
     rate = state["step"] * model.cfg.rays / state["seconds"]
-    left = state["seconds"] * (1 / max(progress, 1e-3) - 1) / 60
+    left = state["seconds"] * max(0, 1 / max(progress, 1e-3) - 1) / 60
     shown = "".join(f"  {k} {line[k]:.3g}" for k in ("psnr", "zeta", "mask") if k in line)
     print(f"  step {state['step']:6d}{shown}  {rate:.0f} rays/s  {left:.1f} min left", flush=True)
     with open(path, "a") as file:
@@ -1166,10 +1161,9 @@ def render_photo(model, scene: Scene, photo: int, code: Tensor) -> dict[str, np.
     """A photo's view under an appearance code (A,): arrays (H,W,...) by name of render_rays, and
     `truth` (H,W,3)."""
     w, h = scene.wh[photo].tolist()
-    img = torch.tensor([photo], device=scene.c2w.device)
-    parts, n = [], 4 * CHUNK if img.is_cuda else CHUNK  # a ray of NeRF-W takes 0.6 MiB
-    for pixel in torch.arange(w * h, device=img.device).split(n):
-        rays = make_rays(scene, img.expand(len(pixel)), pixel)
+    parts, n = [], 4 * CHUNK if scene.c2w.is_cuda else CHUNK  # a ray of NeRF-W takes 0.6 MiB
+    for pixel in torch.arange(w * h, device=scene.c2w.device).split(n):
+        rays = make_rays(scene, torch.full_like(pixel, photo), pixel)
         out = model.render(rays, code.expand(len(pixel), -1)) | dict(truth=rays.rgb)
         parts.append({k: v for k, v in out.items() if v[0].numel() in (1, 3)})  # not the samples'
     whole = {k: torch.cat([p[k] for p in parts]).cpu().numpy() for k in parts[0]}
@@ -1266,9 +1260,11 @@ def panel(model, frames: list[tuple[int, str, dict]], width: int = 240) -> np.nd
         tiles, height = {name: f["truth"], "render": f["rgb"]}, round(
             width * f["rgb"].shape[0] / f["rgb"].shape[1])
         if hasattr(model, "sdf"):
+            tiles["normals"] = f["normal"] / 2 + 0.5
+        if hasattr(model, "sdf") and model.cfg.mask != "off":
             M = to_uint8(model.mask.look([i])[0, 0].sigmoid().detach().cpu().numpy())  # (m,m)
             M = cv2.applyColorMap(M, cv2.COLORMAP_VIRIDIS)[:, :, ::-1] / 255  # (m,m,3)
-            tiles |= {"normals": f["normal"] / 2 + 0.5, "mask: yellow is transient": M}
+            tiles["mask: yellow is transient"] = M
         row = [np.pad(cv2.resize(to_uint8(tile), (width, height), interpolation=cv2.INTER_AREA),
                       ((20, 4), (0, 4), (0, 0)), constant_values=255) for tile in tiles.values()]
         for title, tile in zip(tiles, row):
@@ -1387,9 +1383,7 @@ def execute(cfg: Config, arrays: dict, run: Path, saved: dict | None = None, kin
           f"({len(scene.photos(True))} held out), {len(scene.rgb):,} pixels; {device}; {run}/")
     model, state = train(cfg, scene, run, saved, kind)
     metrics = agreed(RANK or finish(model, scene, state, run))
-    shown = ("psnr", "psnr_floor", "ssim", "lpips", "sdf_error", "mask_iou", "mask_static",
-             "train_seconds", "energy_wh")
-    print("".join(f"  {k} {metrics[k]:.4g}" for k in shown if metrics.get(k) is not None))
+    print("".join(f"  {k} {v:.4g}" for k, v in metrics.items() if isinstance(v, float)))
     return metrics
 
 

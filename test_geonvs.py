@@ -1791,7 +1791,7 @@ def test_a_plan_refines_by_what_the_model_remembers(warm, monkeypatch):
     [(octree, sdf, hits, zeta, max_mb)] = asked
     assert octree is model.sdf.octree and hits is model.hits and (zeta, max_mb) == (pytest.approx(20), 77)
     assert torch.equal(sdf(warm.sfm), model.distance(warm.sfm))
-    octree = (uniform := new_model(warm.scene, grid="uniform", levels=3)).sdf.octree
+    octree = (uniform := new_model(warm.scene, grid="uniform", levels=3, max_mb=41.0)).sdf.octree
     assert counts(octree) == [16 ** 3, 32 ** 3, 64 ** 3]  # fine everywhere, and stays so
     assert torch.equal(uniform.plan(True)["keys"], octree.split_keys)
 
@@ -2181,19 +2181,19 @@ def test_fitting_codes_starts_from_the_mean_sees_left_halves_only_and_touches_no
         w, h = scene.wh[photo].tolist()
         places = {tuple(uv) for rays in seen for uv in (rays.uv[rays.img == photo] * scene.wh[photo]).int().tolist()}
         assert len(places) > 0.9 * (w // 2) * h and {u for u, _ in places} == set(range(w // 2))
-    for left, shade in ((False, 1), (False, 0), (True, 0)):
+    for left, shade in ((False, 9), (False, 0), (True, 0), (True, 255)):
         rgb = scene.rgb.clone()
         for photo in photos.tolist():
             w, h = scene.wh[photo].tolist()
             is_left = torch.arange(w * h) % w < w // 2
-            rgb[scene.start[photo]:scene.start[photo + 1]][is_left == left] *= shade
+            rgb[scene.start[photo]:scene.start[photo + 1]][is_left == left] = shade
         fitted.append(g.fit_codes(model, scene._replace(rgb=rgb), photos, 8, 16))
     close(start := g.fit_codes(model, scene, photos, 0), model.codes()[~scene.is_test].mean(0).expand(2, -1))
     assert torch.equal(fitted[0], fitted[1]) and same_weights(model, warm)
     assert all(p.requires_grad and p.grad is None for p in model.parameters())
     rays = g.make_rays(scene, photos.repeat_interleave(60), torch.arange(120) % 60 * 11)
-    dark, plain = (model.render(rays, c.repeat_interleave(60, 0))["rgb"].mean() for c in (fitted[2], start))
-    assert dark < plain and g.fit_codes(new_model(scene, appearance="off"), scene, photos).shape == (2, 0)
+    dark, plain, bright = (model.render(rays, c.repeat_interleave(60, 0))["rgb"].mean() for c in (fitted[2], start, fitted[3]))
+    assert dark < plain < bright and g.fit_codes(new_model(scene, appearance="off"), scene, photos).shape == (2, 0)
 
 
 class Perfect(nn.Module):
