@@ -187,7 +187,8 @@ def sphere_interval(rays: Rays) -> tuple[Tensor, Tensor]:
     """Distances (R,), (R,) at which rays enter and leave the unit sphere. A ray that misses it, or
     has it behind, gets an empty interval: at its closest approach, or at near."""
     closest = -(rays.o * rays.d).sum(1)  # (R,)
-    half = (closest ** 2 - (rays.o ** 2).sum(1) + 1).clamp(min=0).sqrt()  # (R,)
+    away = rays.at(closest[:, None])[:, 0]  # (R,3) the point nearest to the sphere's centre
+    half = (1 - (away ** 2).sum(1)).clamp(min=0).sqrt()  # (R,)
     t0 = torch.maximum(closest - half, rays.near)  # (R,)
     return t0, torch.maximum(closest + half, t0)
 
@@ -241,6 +242,7 @@ class Octree(nn.Module):
         self.row_key = torch.arange(-PINNED, 0, device=device)  # (V,) the corner that owns a row
         constant = lambda value: nn.Buffer(value.to(device), persistent=False)
         self.per_unit = constant(1 / self.cell(torch.arange(levels)))  # (L,)
+        self.middle = constant(half * self.per_unit[:, None])  # (L,1) of the cube, in cells
         self.trilinear = constant(TRILINEAR)  # (2,3,32)
         steps = torch.tensor([[-1, root ** 2, root, 1], *[[1, 4, 2, 1]] * (levels - 1)]).int()
         self.bits, self.stride = constant(steps[:, :1]), constant(steps[:, 1:])  # (L,1), (L,3)
@@ -293,7 +295,8 @@ class Octree(nn.Module):
         """Nodes (P,L) that hold x (P,3) on the levels that have cells, 8 + the row in cells or of
         the null block; and where in each, 0..1 (P,L,3). Outside the cube: the nearest inside."""
         x = x.nan_to_num(0).clamp(-self.half, self.half * (1 - 1e-6))[:, None]  # (P,1,3)
-        at = (x + self.half) * self.per_unit[:self.active, None]  # (P,L,3) in cells
+        middle, per_unit = self.middle[:self.active], self.per_unit[:self.active, None]  # (L,1)
+        at = torch.addcmul(middle, x, per_unit)  # (P,L,3) in cells
         step = (at.int() & self.bits[:self.active]) * self.stride[:self.active]  # (P,L,3)
         step = step.sum(2, dtype=torch.int32)  # (P,L)
         nodes = [8 + step[:, 0]]  # (P,) root cell, then the child of the cell before
@@ -432,7 +435,7 @@ class LipschitzMLP(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         rows = [len(m.weight) for m in self.layers]
-        norm = torch.cat([torch.linalg.vector_norm(m.weight, 1, 1) for m in self.layers]) + 1e-9
+        norm = torch.cat([m.weight.abs().sum(1) for m in self.layers]) + 1e-9  # (rows,)
         bound = torch.cat([b.expand(n) for b, n in zip(self.bounds(), rows)])  # (rows,)
         scale = (bound / norm).clamp(max=1)[:, None].split(rows)  # (out,1) of each layer
         for i, layer in enumerate(self.layers):
@@ -442,8 +445,8 @@ class LipschitzMLP(nn.Module):
 
 def contract(x: Tensor) -> Tensor:
     """Squeezes |x| > 1 into the ball of radius 2 (mip-NeRF 360 Eq. 10); identity inside."""
-    r = x.norm(dim=-1, keepdim=True).clamp(min=1)  # (...,1)
-    return x * (2 - 1 / r) / r
+    inverse = x.norm(dim=-1, keepdim=True).clamp(min=1).reciprocal()  # (...,1) 1 / |x|
+    return x * (2 - inverse) * inverse
 
 
 class Background(nn.Module):
@@ -463,7 +466,8 @@ class Background(nn.Module):
         t = t1 + u / (1 - u), and the last is opaque."""
         (R, S), n = jitter.shape, jitter.shape[1] // 3
         at, dt = torch.arange(S, device=t0.device) + jitter, (t0 - rays.near)[:, None] / n  # (R,1)
-        before, u = rays.near[:, None] + dt * at[:, :n], (at[:, n:] - n) / (S - n)  # (R,n), (R,S-n)
+        before = torch.addcmul(rays.near[:, None], dt, at[:, :n])  # (R,n)
+        u = (at[:, n:] - n) / (S - n)  # (R,S-n)
         beyond = t1[:, None] + u / (1 - u).clamp(min=1e-3)  # (R,S-n)
         x = contract(rays.at(torch.cat([before, beyond], 1))).reshape(-1, 3)  # (RS,3)
         feat = torch.cat([x, self.octree(x).flatten(1)], 1)  # (RS,3+LC)
@@ -522,7 +526,7 @@ def inverse_cdf(edges: Tensor, weight: Tensor, u: Tensor) -> Tensor:
     hi = torch.searchsorted(cdf, u.contiguous(), right=True).clamp(1, weight.shape[1])  # (R,S)
     both = torch.cat([hi - 1, hi], 1)  # (R,2S)
     (c0, c1), (e0, e1) = cdf.gather(1, both).chunk(2, 1), edges.gather(1, both).chunk(2, 1)  # (R,S)
-    return e0 + (e1 - e0) * ((u - c0) / (c1 - c0).clamp(min=1e-9)).clamp(0, 1)
+    return torch.lerp(e0, e1, ((u - c0) / (c1 - c0).clamp(min=1e-9)).clamp(0, 1))
 
 
 PROBES = 64  # cheap lookups of the cached SDF per ray
@@ -561,7 +565,7 @@ class SDFCache(nn.Module):
         u = (torch.arange(n, device=t0.device) + jitter[:, :n]) / n  # (R,S-1)
         probes = torch.lerp(t0, t1, torch.linspace(0, 1, PROBES + 1, device=t0.device))  # (R,N+1)
         weight = self.weights(rays, probes, zeta)  # (R,N)
-        weight = weight + (FLOOR / (1 - FLOOR) * weight.sum(1, keepdim=True) + 1e-3) / PROBES
+        weight = weight + (weight.sum(1, keepdim=True) * (FLOOR / (1 - FLOOR) / PROBES) + 1e-5)
         return torch.cat([t0, inverse_cdf(probes, weight, u), t1], 1)  # (R,S+1)
 
 
@@ -573,7 +577,7 @@ def render_rays(model: "GeoNVS", rays: Rays, code: Tensor, jitter: Tensor) -> di
     t0, t1 = sphere_interval(rays)  # (R,)
     seen_zeta = zeta if cfg.sampling == "cached" else 0 * zeta  # 0: nothing is seen, even sections
     edges = model.cache.edges(rays, t0, t1, jitter[:, :S], seen_zeta)  # (R,S+1)
-    t = (edges[:, 1:] + edges[:, :-1]) / 2  # (R,S)
+    t = torch.lerp(edges[:, :-1], edges[:, 1:], 0.5)  # (R,S)
     x = rays.at(t).reshape(-1, 3)  # (RS,3)
     sdf, geo, grad = model.sdf(x, cfg.normals == "analytic")  # (RS,), (RS,G), (RS,3) [D13]
     if cfg.normals == "fd":
@@ -581,22 +585,23 @@ def render_rays(model: "GeoNVS", rays: Rays, code: Tensor, jitter: Tensor) -> di
         grad, _ = finite_differences(torch.cat([sdf[:, None], ends], 1), model.eps)  # (RS,3)
     length = grad.norm(dim=1, keepdim=True)  # (RS,1)
     normal = grad / (length + 1e-12)  # (RS,3)
-    cos = (grad.reshape(R, S, 3) * rays.d[:, None]).sum(2)  # (R,S)
+    cos = torch.einsum("rsi,ri->rs", grad.reshape(R, S, 3), rays.d)
     opacity_of = neus_alpha if cfg.alpha == "neus" else printed_alpha
     alpha = opacity_of(sdf.reshape(R, S), cos, torch.diff(edges), zeta)  # (R,S)
     w, trans = composite(alpha)  # (R,S), (R,); 0 and 1 where a ray misses: no section has a length
     per_ray = torch.cat([direction_basis(rays.d), code], 1)  # (R,9+A)
     inputs = torch.cat([geo, normal, per_ray.repeat_interleave(S, 0)], 1)  # (RS,G+3+9+A)
-    rgb = (w[:, :, None] * model.color(inputs).sigmoid().reshape(R, S, 3)).sum(1)  # (R,3)
-    front, passes, behind = 0, torch.ones_like(trans), model.bg_color  # (3,)
-    if model.background is not None:
+    rgb = torch.einsum("rs,rsc->rc", w, model.color(inputs).sigmoid().reshape(R, S, 3))  # Eq. 2
+    if model.background is None:
+        front, passes, behind = 0, trans.new_ones(R), model.bg_color
+    else:
         front, passes, behind = model.background(rays, t0, t1, per_ray, jitter[:, S:])
     eikonal = ((length - 1) ** 2).reshape(R, S) * (t1 > t0)[:, None]  # a miss has none
     with torch.no_grad():
-        depth = (w * t).sum(1) + trans * t1  # (R,)
+        depth = torch.einsum("rs,rs->r", w, t) + trans * t1
         seen = dict(opacity=1 - trans, depth=depth, x=rays.at(depth[:, None])[:, 0],
-                    normal=(w[:, :, None] * normal.reshape(R, S, 3)).sum(1),
-                    e_grad=(w * eikonal).sum(1))  # NeuS-weighted [D3]
+                    normal=torch.einsum("rs,rsi->ri", w, normal.reshape(R, S, 3)),
+                    e_grad=torch.einsum("rs,rs->r", w, eikonal))  # NeuS-weighted [D3]
     rgb = front + passes[:, None] * rgb + trans[:, None] * behind  # (R,3)
     return seen | dict(rgb=rgb, eikonal=eikonal)
 
@@ -698,7 +703,7 @@ class TransientMask(nn.Module):
     def remember(self, rays: Rays, residual: Tensor, bend: Tensor, opacity: Tensor) -> None:
         """Keeps residual (R,3), bend and opacity (R,) where the network will look for them."""
         m = self.seen.shape[-1]
-        col, row = (rays.uv * m).long().clamp(max=m - 1).unbind(1)  # (R,)
+        col, row = (rays.uv * m).long().unbind(1)  # (R,)
         seen = opacity.clamp(min=0)  # (R,) as printed it may be negative, which would say: no ray
         found = torch.cat([residual, bend[:, None], seen[:, None]], 1)  # (R,5)
         self.seen[rays.img, :, row, col] = found.nan_to_num(0, 0, 0)
@@ -976,14 +981,14 @@ def training_step(model, optimizer, photos: Tensor, state: dict, progress: float
     if RANKS > 1:  # their mean over the processes
         dist.all_reduce(flat)
         nn.utils.vector_to_parameters(flat[1:] / RANKS, grads)
-    is_void = ~torch.isfinite(flat.sum())
+    is_void = flat.sum() * 0 != 0  # NaN and infinity times 0 are NaN
     optimizer.found_inf = is_void.float()  # fused Adam leaves such a step out
     factor = min(1, (state["step"] + 1) / 20) * (0.525 + 0.475 * math.cos(math.pi * progress))
     for group, now in zip(optimizer.param_groups, model.groups()):
         group["lr"] = factor * now["lr"]
     optimizer.step()
     state["step"] += 1
-    return terms, is_void.long()
+    return terms, is_void
 
 
 def save_checkpoint(path: Path, model, optimizer, gen, state: dict) -> None:
@@ -1003,7 +1008,7 @@ def read_checkpoint(path: Path, given: dict) -> tuple[dict, Config]:
         data_prep.refuse_bomb(path)
         saved = dict(torch.load(path, map_location="cpu", weights_only=True))
         cfg = Config(**saved["config"])
-        need(saved["state"]["step"] >= 0, "")
+        need(dict(saved["state"])["step"] >= 0, "")
     except Exception as error:  # a damaged file can fail in any layer: zip, pickle, tensor storage
         raise UserError(f"{path} is damaged, too large for the memory or of another program "
                         f"({type(error).__name__}): train again under another --name") from None

@@ -1535,7 +1535,7 @@ def test_the_mask_network_is_told_where_sfm_points_are_seen_and_masks_nothing_at
 
 def test_errors_are_remembered_where_the_mask_network_looks_for_them_and_bad_ones_as_nothing(scene):
     mask, (rays, _) = small_mask(scene), batch(scene)
-    rays = rays._replace(img=torch.tensor([3, 5, 6]), uv=torch.tensor([[0.9, 0.1], [0, 1], [0.5, 0.5]]))
+    rays = rays._replace(img=torch.tensor([3, 5, 6]), uv=torch.tensor([[0.9, 0.1], [0, 0.99], [0.5, 0.5]]))
     residual = torch.tensor([[0.7, -0.6, 0.5], [-0.2, 0.3, 0.0], [math.nan, math.inf, -math.inf]])
     mask.remember(rays, residual, torch.tensor([0.4, 0.1, math.nan]), torch.tensor([0.9, 0.8, math.inf]))
     close(mask.seen[3, :, 1, 14], [0.7, -0.6, 0.5, 0.4, 0.9])  # u along the width
