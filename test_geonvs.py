@@ -2662,10 +2662,10 @@ PUBLISHED = {g.GeoNVS: {}, NeRFW: dict(rays=1024, photos=1024, samples=64, hidde
              HaNeRF: dict(rays=1024, photos=1, samples=64, hidden=256, lr_net=5e-4)}
 SMALL = {g.GeoNVS: dict(rays=256, lr_net=1e-2), NeRFW: dict(rays=256, photos=256, samples=24, hidden=64, lr_net=5e-3),
          HaNeRF: dict(rays=256, photos=1, samples=16, hidden=64, lr_net=4e-3)}  # what serves the toy best
-PIECES = {"full": {}, "no GPL": dict(lam_gpl=0.0), "literal GPL": dict(gpl="literal"),
-          "printed mask": dict(mask="printed"), "printed mask, no GPL": dict(mask="printed", lam_gpl=0.0),
-          "no mask": dict(mask="off"), "no appearance": dict(appearance="off"), "no SfM term": dict(lam_sfm=0.0),
-          "no background": dict(background="off"), "no curvature": dict(lam_curv=0.0),
+PIECES = {"full": {}, "no GPL": dict(lam_gpl=0.0), "literal GPL": dict(gpl="literal"), "no mask": dict(mask="off"),
+          "printed mask": dict(mask="printed", lam_mask=0.15), "no SfM term": dict(lam_sfm=0.0),
+          "printed mask, no GPL": dict(mask="printed", lam_mask=0.15, lam_gpl=0.0), "no curvature": dict(lam_curv=0.0),
+          "no appearance": dict(appearance="off"), "no background": dict(background="off"),
           "no Lipschitz": dict(lam_lps=0.0), "uniform sampling": dict(sampling="uniform"),
           "printed alpha": dict(alpha="printed"), "finite differences": dict(normals="fd")}
 GRID = {"octree": {}, "uniform grid": dict(grid="uniform"), "a level less": dict(deeper=-1),
@@ -2719,12 +2719,13 @@ def run_row(run, given, toy=None, kind=g.GeoNVS, deeper=0, **row):
 
 
 def line_of(name, runs):
-    """A line of the table: mean and spread (standard deviation) over seeds, None where nothing was measured.
+    """A line of the table: mean and spread (standard deviation) over seeds, None where too little was measured.
     Failures: runs that diverged or ended below the trivial predictor."""
     line = dict(row=name, runs=len(runs), failures=sum("failed" in m or m["psnr"] < m["psnr_floor"] for m in runs))
     for key in FIGURES:
         values = [m[key] for m in runs if m.get(key) is not None]
-        line[key], line[key + "_std"] = (float(np.mean(values)), float(np.std(values))) if values else (None, None)
+        line |= {key: float(np.mean(values)) if values else None,
+                 key + "_std": float(np.std(values)) if len(values) > 1 else None}
     return line
 
 
@@ -2740,24 +2741,23 @@ def draw(name, table):
     """The figure of an experiment, from its table alone: PSNR over what it cost, or what each row gains over the
     first row, the best one last; in `stress` over the trivial predictor."""
     from matplotlib.figure import Figure
-    rows = [r for r in table if r["psnr"]]
+    rows = sorted((r for r in table if r["psnr"]), key=lambda r: r["psnr"] if name in ("pieces", "grid") else 0)
     if name != "chart":
-        rows = rows if name == "stress" else sorted(rows, key=lambda r: r["psnr"])
         gains = [r["psnr"] - (r["psnr_floor"] if name == "stress" else table[0]["psnr"]) for r in rows]
-        axis = Figure(figsize=(6.5, 1 + 0.25 * len(rows))).subplots()
+        axis = Figure(figsize=(7.5, 1 + 0.25 * len(rows)), layout="constrained").subplots()
         names = [r["row"] + (f" ({r['failures']} of {r['runs']} failed)" if r["failures"] else "") for r in rows]
-        axis.barh(names, gains, xerr=[r["psnr_std"] for r in rows], capsize=3,
+        axis.barh(names, gains, xerr=[r["psnr_std"] or math.nan for r in rows], capsize=3,
                   color=["tab:orange" if gain < 0 else "tab:blue" for gain in gains])
         over = "the trivial predictor" if name == "stress" else f"'{table[0]['row']}', {table[0]['psnr']:.2f} dB"
         axis.set(xlabel=f"PSNR over {over}, dB", ylim=(len(rows), -1))
         return axis.figure
-    axes = dict(train_seconds="training, s", energy_wh="energy, Wh")
-    axes = {unit: text for unit, text in axes.items() if any(r[unit] for r in rows)}
-    figure = Figure(figsize=(6.5 * len(axes), 4))
-    for axis, (unit, text) in zip(figure.subplots(1, len(axes), squeeze=False)[0], axes.items()):
+    costs = (("train_seconds", "training, s"), ("energy_wh", "energy, Wh"))
+    axes = [(unit, text) for unit, text in costs if any(r[unit] for r in rows)]
+    figure = Figure(figsize=(6.5 * len(axes), 4), layout="constrained")
+    for axis, (unit, text) in zip(figure.subplots(1, len(axes), squeeze=False)[0], axes):
         for kind in dict.fromkeys(r["row"].split(" x")[0] for r in rows):
-            mine = [r for r in rows if r["row"].split(" x")[0] == kind and r[unit]]
-            axis.errorbar(*([r[k] for r in mine] for k in (unit, "psnr", "psnr_std")), marker="o", capsize=3, label=kind)
+            mine = [(r[unit], r["psnr"], r["psnr_std"] or math.nan) for r in rows if r["row"].startswith(kind) and r[unit]]
+            axis.errorbar(*zip(*mine), marker="o", capsize=3, label=kind)
         axis.axhline(np.mean([r["psnr_floor"] for r in rows]), color="grey", label="trivial predictor")
         axis.set(xscale="log", xlabel=text, ylabel="PSNR of held-out right halves, dB")
         axis.xaxis.set_major_formatter("{x:g}")
@@ -2791,8 +2791,8 @@ def experiment(argv):
     text = "\n".join(",".join("" if v is None else f'"{v}"' if "," in str(v) else str(v) for v in r) for r in lines)
     data_prep.atomic_write(Path(f"{name}.csv"), lambda tmp: Path(tmp).write_text(text + "\n"))
     figure, trained = draw(name, table), sum(r["train_seconds"] * r["runs"] for r in table if r["train_seconds"])
-    figure.suptitle(f"{cfg.data or cfg.scene}, {seeds} seeds, {trained / 60:.0f} minutes of training", fontsize=9)
-    data_prep.atomic_write(Path(f"{name}.png"), lambda tmp: figure.savefig(tmp, dpi=110, bbox_inches="tight"))
+    figure.suptitle(f"{cfg.data or cfg.scene}, seeds: {seeds}, {trained / 60:.0f} minutes of training", fontsize=9)
+    data_prep.atomic_write(Path(f"{name}.png"), lambda tmp: figure.savefig(tmp, dpi=110))
     print(f"wrote {name}.csv and {name}.png after {time.perf_counter() - begin:.0f} s")
 
 
