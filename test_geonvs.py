@@ -2748,7 +2748,7 @@ def draw(name, table):
         names = [r["row"] + (f" ({r['failures']} of {r['runs']} failed)" if r["failures"] else "") for r in rows]
         axis.barh(names, gains, xerr=[r["psnr_std"] or math.nan for r in rows], capsize=3,
                   color=["tab:orange" if gain < 0 else "tab:blue" for gain in gains])
-        over = "the trivial predictor" if name == "stress" else f"'{table[0]['row']}', {table[0]['psnr']:.2f} dB"
+        over = "the trivial predictor" if name == "stress" else f"that of '{table[0]['row']}' ({table[0]['psnr']:.2f} dB)"
         axis.set(xlabel=f"PSNR over {over}, dB", ylim=(len(rows), -1))
         return axis.figure
     costs = (("train_seconds", "training, s"), ("energy_wh", "energy, Wh"))
