@@ -80,7 +80,7 @@ class Config:
     bg_samples: int = opt(24, "background samples per ray, a third of them before the sphere")
     levels: int = opt(0, "octree levels, 0: from the pixel footprint at the surface")
     grid: str = opt("octree", "uniform: the same finest cell everywhere", "octree", "uniform")
-    max_mb: float = opt(1000.0, "memory of training up to which the octree may grow, MiB")
+    max_mb: float = opt(1000.0, "up to which octree and Adam's moments may grow, MiB")
     hidden: int = opt(64, "width of the MLPs")
     appearance_dim: int = opt(16, "length of a photo's appearance code")
     appearance: str = opt("auto", "codes; auto: on if exposures differ", "auto", "on", "off")
