@@ -585,20 +585,20 @@ def render_rays(model: "GeoNVS", rays: Rays, code: Tensor, jitter: Tensor) -> di
         grad, _ = finite_differences(torch.cat([sdf[:, None], ends], 1), model.eps)  # (RS,3)
     length = grad.norm(dim=1, keepdim=True)  # (RS,1)
     normal = grad / (length + 1e-12)  # (RS,3)
-    cos = torch.einsum("rsi,ri->rs", grad.reshape(R, S, 3), rays.d)
+    cos = torch.einsum("rsi,ri->rs", grad.reshape(R, S, 3), rays.d)  # (R,S)
     opacity_of = neus_alpha if cfg.alpha == "neus" else printed_alpha
     alpha = opacity_of(sdf.reshape(R, S), cos, torch.diff(edges), zeta)  # (R,S)
     w, trans = composite(alpha)  # (R,S), (R,); 0 and 1 where a ray misses: no section has a length
     per_ray = torch.cat([direction_basis(rays.d), code], 1)  # (R,9+A)
     inputs = torch.cat([geo, normal, per_ray.repeat_interleave(S, 0)], 1)  # (RS,G+3+9+A)
-    rgb = torch.einsum("rs,rsc->rc", w, model.color(inputs).sigmoid().reshape(R, S, 3))  # Eq. 2
+    rgb = torch.einsum("rs,rsc->rc", w, model.color(inputs).sigmoid().reshape(R, S, 3))  # (R,3)
     if model.background is None:
         front, passes, behind = 0, trans.new_ones(R), model.bg_color
     else:
         front, passes, behind = model.background(rays, t0, t1, per_ray, jitter[:, S:])
     eikonal = ((length - 1) ** 2).reshape(R, S) * (t1 > t0)[:, None]  # a miss has none
     with torch.no_grad():
-        depth = torch.einsum("rs,rs->r", w, t) + trans * t1
+        depth = torch.einsum("rs,rs->r", w, t) + trans * t1  # (R,)
         seen = dict(opacity=1 - trans, depth=depth, x=rays.at(depth[:, None])[:, 0],
                     normal=torch.einsum("rs,rsi->ri", w, normal.reshape(R, S, 3)),
                     e_grad=torch.einsum("rs,rs->r", w, eikonal))  # NeuS-weighted [D3]
