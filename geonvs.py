@@ -29,7 +29,8 @@ Where the printed paper is departed from, the line carries its tag:
   [D7]  the mask pays mean M, not mean M^2, to go with an L1 error, above what SfM pixels err by
   [D8]  the background also fills what lies before the sphere; its last section is opaque
   [D9]  all is float32: mixed precision, as the paper has it, makes noise of distances and normals
-  [D10] SfM points place the sphere, seed the octree, pull |s(p)| to zero and teach M = 0
+  [D10] SfM points place the sphere, seed the octree, teach M = 0 and pull s(p) to zero, but less
+        where the surface is fog: a strong pull would leave it there
   [D11] samples are drawn from a cached SDF volume; no second network pass along the ray
   [D12] test photos: appearance fitted on the left half, scored on the right half
   [D13] exact normals by trilinear weights (--normals fd: as printed); curvature where a ray ends
@@ -95,7 +96,7 @@ class Config:
     lam_gpl: float = opt(0.05, "weight of the geometry-preservation loss (paper)")
     lam_lps: float = opt(1e-5, "weight of the Lipschitz loss, log form [D5] [R]")
     lam_off: float = opt(1e-3, "weight of the off-surface loss [R]")
-    lam_sfm: float = opt(0.3, "weight of |s(p)| at SfM points [D10]")
+    lam_sfm: float = opt(7.5e-3, "weight of min(zeta, 40) |s(p)| at SfM points [D10]")
     lam_mask: float = opt(0.04, "weight of mean M: the excess error that masks a pixel [D7]")
     lr_grid: float = opt(1e-2, "learning rate of octree features and appearance codes")
     lr_net: float = opt(2e-3, "learning rate of networks")
@@ -407,7 +408,7 @@ MEAN = torch.tensor([-1, 0.25, 0.25, 0.25, 0.25])  # (5,) of the ends, less the 
 
 def taps(x: Tensor, eps: float) -> Tensor:
     """Where finite_differences wants s around x (P,3): at x + eps k, |k| = 0 or 1. (P,5,3)"""
-    return x[:, None] + eps * resident(TAPS, x.device).to(x.dtype)
+    return torch.add(x[:, None], resident(TAPS, x.device).to(x.dtype), alpha=eps)
 
 
 def finite_differences(s: Tensor, eps: float) -> tuple[Tensor, Tensor]:
@@ -468,7 +469,7 @@ class Background(nn.Module):
         at, dt = torch.arange(S, device=t0.device) + jitter, (t0 - rays.near)[:, None] / n  # (R,1)
         before = torch.addcmul(rays.near[:, None], dt, at[:, :n])  # (R,n)
         u = (at[:, n:] - n) / (S - n)  # (R,S-n)
-        beyond = t1[:, None] + u / (1 - u).clamp(min=1e-3)  # (R,S-n)
+        beyond = torch.addcdiv(t1[:, None], u, (1 - u).clamp(min=1e-3))  # (R,S-n)
         x = contract(rays.at(torch.cat([before, beyond], 1))).reshape(-1, 3)  # (RS,3)
         feat = torch.cat([x, self.octree(x).flatten(1)], 1)  # (RS,3+LC)
         density, geo = self.density(feat).split([1, GEO], 1)  # (RS,1), (RS,GEO)
@@ -490,8 +491,8 @@ class Deviation(nn.Module):
         super().__init__()
         self.v = nn.Parameter(torch.tensor(math.log(zeta) / 10))
 
-    def forward(self) -> Tensor:
-        return torch.exp(10 * self.v).clamp(1e-2, 1e5)
+    def forward(self, most: float = 1e5) -> Tensor:
+        return torch.exp(10 * self.v).clamp(1e-2, most)
 
 
 def neus_alpha(sdf: Tensor, cos: Tensor, dt: Tensor, zeta: Tensor) -> Tensor:
@@ -565,7 +566,8 @@ class SDFCache(nn.Module):
         u = (torch.arange(n, device=t0.device) + jitter[:, :n]) / n  # (R,S-1)
         probes = torch.lerp(t0, t1, torch.linspace(0, 1, PROBES + 1, device=t0.device))  # (R,N+1)
         weight = self.weights(rays, probes, zeta)  # (R,N)
-        weight = weight + (weight.sum(1, keepdim=True) * (FLOOR / (1 - FLOOR) / PROBES) + 1e-5)
+        weight = torch.add(weight + 1e-5, weight.sum(1, keepdim=True),
+                           alpha=FLOOR / (1 - FLOOR) / PROBES)  # (R,N)
         return torch.cat([t0, inverse_cdf(probes, weight, u), t1], 1)  # (R,S+1)
 
 
@@ -598,7 +600,7 @@ def render_rays(model: "GeoNVS", rays: Rays, code: Tensor, jitter: Tensor) -> di
         front, passes, behind = model.background(rays, t0, t1, per_ray, jitter[:, S:])
     eikonal = ((length - 1) ** 2).reshape(R, S) * (t1 > t0)[:, None]  # a miss has none
     with torch.no_grad():
-        depth = torch.einsum("rs,rs->r", w, t) + trans * t1  # (R,)
+        depth = torch.addcmul(torch.einsum("rs,rs->r", w, t), trans, t1)  # (R,)
         seen = dict(opacity=1 - trans, depth=depth, x=rays.at(depth[:, None])[:, 0],
                     normal=torch.einsum("rs,rsi->ri", w, normal.reshape(R, S, 3)),
                     e_grad=torch.einsum("rs,rs->r", w, eikonal))  # NeuS-weighted [D3]
@@ -755,6 +757,9 @@ def octrees_of(model: nn.Module) -> list[Octree]:
     return [part for part in model.modules() if isinstance(part, Octree)]
 
 
+SHARP = 40.0  # zeta from which on SfM points pull with their full weight; at fog they pull less
+
+
 class GeoNVS(nn.Module):
     """The paper's model: it assembles the parts above and sums their losses. What stands from
     `losses` on is what training and scoring ask of any model; rivals in the tests answer too."""
@@ -830,14 +835,14 @@ class GeoNVS(nn.Module):
                      curv=e_curv.mean(),  # [D4]
                      lps=torch.log(self.color.bounds()).sum(),  # [D5]
                      off=torch.exp(-50 * off.abs()).mean(),
-                     sfm=sfm.abs().mean())  # [D10]
+                     sfm=self.deviation(SHARP).detach() * sfm.abs().mean())  # [D10]
         total = torch.stack([terms[name] for name in self.terms]) @ self.lam
         with torch.no_grad():  # what refining and the mask will want to know
             pixel = out["depth"] / self.scene.K[rays.img, 0]  # (R,) its size at the ray's end
             hits = torch.cat([out["x"], kept[:, None], pixel[:, None]], 1)  # (R,5)
             first = step * R % len(self.hits)
             self.hits[first:first + R] = hits.nan_to_num(2, 2, 2)
-            bend = LAM_GRAD * out["e_grad"] + LAM_LAP * e_curv  # (R,) [D3]
+            bend = torch.add(LAM_GRAD * out["e_grad"], e_curv, alpha=LAM_LAP)  # (R,) [D3]
             self.mask.remember(rays, residual, bend, out["opacity"])
         if is_on and step % MASK_EVERY == 0:
             self.mask.calibrate(bend, 0.2 if cfg.gpl == "calibrated" else 0.0)
@@ -981,8 +986,8 @@ def training_step(model, optimizer, photos: Tensor, state: dict, progress: float
     if RANKS > 1:  # their mean over the processes
         dist.all_reduce(flat)
         nn.utils.vector_to_parameters(flat[1:] / RANKS, grads)
-    is_void = flat.sum() * 0 != 0  # NaN and infinity times 0 are NaN
-    optimizer.found_inf = is_void.float()  # fused Adam leaves such a step out
+    is_void = (flat.sum() * 0).nan_to_num(1)  # 0 or 1, as NaN and infinity times 0 are NaN
+    optimizer.found_inf = is_void  # fused Adam leaves such a step out
     factor = min(1, (state["step"] + 1) / 20) * (0.525 + 0.475 * math.cos(math.pi * progress))
     for group, now in zip(optimizer.param_groups, model.groups()):
         group["lr"] = factor * now["lr"]

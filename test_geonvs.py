@@ -1654,7 +1654,7 @@ def test_each_term_of_the_objective_and_all_that_is_remembered_equal_their_defin
     assert 0 < out["eikonal"].any(1).sum() <= 32 and e_curv.max() > 1e-3
     want = dict(rgb=error.mean(), eik=out["eikonal"].mean(), curv=e_curv.mean(),
                 lps=F.softplus(model.color.c).log().sum(), off=torch.exp(-50 * s[320:352].abs()).mean(),
-                sfm=s[352:].abs().mean(), mask=mask.mean())
+                sfm=warm.deviation() * s[352:].abs().mean(), mask=mask.mean())
     for name, value in want.items():
         assert raw[name].mean().item() == pytest.approx(value.item(), rel=1e-4), name
     assert total.item() == pytest.approx(objective(want), rel=1e-4)
@@ -1687,7 +1687,7 @@ def test_losses_are_finite_with_any_setting_mask_sdf_and_sharpness_and_beside_th
         model.deviation = g.Deviation(zeta)
         _, raw = model.losses(rays, pick, 1, generator())
         assert finite(model, rays, pick) and raw["eik"].item() == pytest.approx(share, abs=1e-7 + 1e-4 * abs(value))
-        close([raw[k].item() for k in ("curv", "off", "sfm")], [0, math.exp(-50 * abs(value)), abs(value)])
+        close([raw[k].item() for k in ("curv", "off", "sfm")], [0, math.exp(-50 * abs(value)), abs(value) * min(zeta, g.SHARP)])
 
 
 def test_only_lessons_teach_the_mask_and_every_eighth_step_the_cache(warm, scene):
