@@ -1674,7 +1674,7 @@ def test_losses_are_finite_with_any_setting_mask_sdf_and_sharpness_and_beside_th
     away = rays._replace(o=rays.o * 100)  # no ray meets the sphere
     assert finite(model, away, pick) and model.losses(away, pick, 1, generator())[1]["eik"] == 0
     model.zero_grad()
-    model.losses(rays, pick, 1, generator())[1]["curv"].backward()  # flattens the surface and does not hide it
+    sum(model.losses(rays, pick, 1, generator())[1][k] for k in ("curv", "sfm")).backward()  # move it, hide nothing
     assert all(p.grad is None or name.startswith("sdf.") for name, p in model.named_parameters())
     for logit in (-1e4, 1e4):
         model.mask.logits.fill_(logit)
