@@ -2130,7 +2130,7 @@ def test_two_processes_train_one_model_on_the_rays_of_both(tmp_path, monkeypatch
     assert [process.returncode for process in pair] == [0, 0] and said != "" == silence, errors + more
     a, b, alone = (torch.load(tmp_path / name) for name in ("pair/0 of 2.pt", "pair/1 of 2.pt", "alone/0 of 1.pt"))
     states, rays = [end.pop("state") for end in (a, b, alone)], [end.pop("hits") for end in (a, b)]
-    assert [(state["dropped"], state["joules"]) for state in states] == [(1, 10), (1, 20), (1, 10)]  # each reads a meter
+    assert [(s["dropped"], s["joules"]) for s in states] == [(1, 10), (1, 20), (1, 10)]  # each reads a meter
     assert all(torch.equal(a[name], b[name]) for name in a) and not torch.equal(*rays)
     start, end, other = (log_of(tmp_path / run)[-1]["psnr"] for run in ("pair/runs/b", "pair/runs/a", "alone/runs/a"))
     assert end == pytest.approx(other, abs=0.5) and end > start + 0.5  # it learns as one process does
