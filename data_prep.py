@@ -342,8 +342,8 @@ def make_toy(seed=0, size=96, photos=48, test=8, occluders=0.05, exposure=1.0, p
 
 def finish(images, K, c2w, is_test, name, points, tracks, info, contain=()):
     """The scene of images (h,w,3), each of which observes the points tracks (M,). World units: c2w;
-    points (K,5): x y z, error [px], views; contain (P,3). Unit sphere: the points' geometric median
-    by views, 1.1 x the distance that holds 95 %; contain; 30 % of 9 in 10 training photos' own."""
+    points (K,5): x y z, error [px], views; contain (P,3). Unit sphere: geometric median of points
+    by views, 1.1 x the distance of 95 %; contain; 30 % of 9 in 10 training photos' own. [D10]"""
     error, views, rng = points[:, 3], points[:, 4], np.random.default_rng(0)
     usable = views >= (3 if (views >= 3).sum() >= 500 else 2)
     need(usable.sum() >= 20, f"{usable.sum()} usable 3D points: SfM needs more overlapping photos")

@@ -8,7 +8,7 @@ one ray from the pixel to the loss; then comes the training loop around it.
     python geonvs.py --scene brandenburg   a Phototourism scene (one GPU); also sacre, trevi, taj
     python geonvs.py --data DIR            your own COLMAP folder
     torchrun --nproc_per_node 4 geonvs.py  on 4 GPUs that share the rays of each step
-    python geonvs.py --help                every setting with its meaning, unit and source
+    python geonvs.py --help                every setting with its meaning and default
 
 Conventions
   world     the foreground is the unit sphere; x_file = x * scale + center leads back to SfM units
@@ -23,14 +23,14 @@ Where the printed paper is departed from, the line carries its tag:
   [D1]  alpha is divided by sigmoid(zeta s_prev) and never negative (printed: a wall is 63 % opaque)
   [D2]  the slope correction sits inside zeta, with opposite signs for the two ends of a section
   [D3]  Phi: NeuS-weighted E_grad, |lap| eps, calibrated by quantiles, detached, times opacity
-  [D4]  the curvature loss is |lap| times eps: |lap| of a trilinear field grows as eps shrinks
+  [D4]  the curvature loss is |lap| eps opacity: |lap| of a trilinear field grows as eps shrinks
   [D5]  the Lipschitz term is a sum of logs, not a product that can drown the colour at first
-  [D6]  CGNet: GroupNorm, ReLU, half the width, one block a stage, negative bias, finer head
-  [D7]  the mask pays mean M, not mean M^2, to go with an L1 error, above what SfM pixels err by
+  [D6]  CGNet: GroupNorm, ReLU, half width, a block a stage, no residual, low bias, finer head
+  [D7]  the mask pays M, not M^2, as the error is L1; its price lies above what SfM pixels err by
   [D8]  the background also fills what lies before the sphere; its last section is opaque
   [D9]  all is float32: mixed precision, as the paper has it, makes noise of distances and normals
   [D10] SfM points place the sphere, seed the octree, teach M = 0 and pull s(p) to zero, but less
-        where the surface is fog: a strong pull would leave it there
+        while the surface is fog: a strong pull would leave it so
   [D11] samples are drawn from a cached SDF volume; no second network pass along the ray
   [D12] test photos: appearance fitted on the left half, scored on the right half
   [D13] exact normals by trilinear weights (--normals fd: as printed); curvature where a ray ends
@@ -90,7 +90,7 @@ class Config:
     normals: str = opt("analytic", "derivatives of the SDF [D13]", "analytic", "fd")
     sampling: str = opt("cached", "how samples are placed [D11]", "cached", "uniform")
     alpha: str = opt("neus", "opacity of a section [D1] [D2]", "neus", "printed")
-    gpl: str = opt("calibrated", "the sigmoid of Phi [D3]", "calibrated", "literal")
+    gpl: str = opt("calibrated", "centre and width of Phi [D3]", "calibrated", "literal")
     lam_eik: float = opt(0.04, "weight of the eikonal loss (Permuto-SDF)")
     lam_curv: float = opt(3e-3, "weight of the curvature loss, on |lap| eps [D4]")
     lam_gpl: float = opt(0.05, "weight of the geometry-preservation loss (paper)")
@@ -135,8 +135,8 @@ class Scene(NamedTuple):
     near: Tensor  # (I,) smallest useful t
     is_test: Tensor  # (I,)
     points: Tensor  # (K,3) SfM points
-    track_photo: Tensor  # (T,) a photo that shows
-    track_uv: Tensor  # (T,2) an SfM point at a place, over photo size, 0..1
+    track_photo: Tensor  # (T,) the photo of a sighting of an SfM point
+    track_uv: Tensor  # (T,2) where in that photo, over its size; in the picture if in 0..1
     thumbs: Tensor  # (I,3,n,n) uint8, whole photos for the mask network
     raw: dict  # the file in numpy: names, statistics, center, scale, ground truth of the toy
     info: dict
@@ -344,8 +344,8 @@ def refined_keys(octree: Octree, sdf, hits: Tensor, zeta: float, max_mb: float) 
     """Split keys that fit the octree to the scene. sdf: (P,3) to (P,); hits (P,5): where recent
     rays ended, their error, a pixel's size there; 2 where none was. A cell at the surface is split
     if enough rays end in it, they miss their colour, and the children are not finer than pixels;
-    worst first, as far as max_mb allows. It is merged if nothing of it, nor within a child's side,
-    is nearer to the surface than HIDDEN / zeta, from where on the field is hardly seen."""
+    worst first, as far as max_mb allows. It is merged if nothing of it, nor within its side, is
+    nearer to the surface than HIDDEN / zeta, from where on the field is hardly seen."""
     is_inside = hits[:, :3].norm(dim=1) < 1  # (P,) rays that miss the sphere split no cells
     if not is_inside.any():
         return octree.split_keys
@@ -846,7 +846,7 @@ class GeoNVS(nn.Module):
             self.mask.remember(rays, residual, bend, out["opacity"])
         if is_on and step % MASK_EVERY == 0:
             self.mask.calibrate(bend, 0.2 if cfg.gpl == "calibrated" else 0.0)
-            taught, terms["gpl"] = self.mask.objective(pick)  # lam_mask L_reg + lam_GPL L_GPL
+            taught, terms["gpl"] = self.mask.objective(pick)  # all terms of M in Eq. 5
             total = total + taught
         return total, terms | dict(mask=mask)
 
@@ -1354,7 +1354,8 @@ def film(model, scene: Scene, path: Path, rays: float = 4e6) -> None:
 
 def make_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0], allow_abbrev=False,
-                                     argument_default=argparse.SUPPRESS)
+                                     argument_default=argparse.SUPPRESS,
+                                     epilog="[R] is open in the paper; [Dn]: see geonvs.py's head")
     parser.error = lambda message: need(False, f"{message}: see python geonvs.py --help")
     for f in fields(Config):
         parser.add_argument(f"--{f.name}", type=type(f.default), choices=f.metadata["choices"],
