@@ -36,7 +36,7 @@ Where the printed paper is departed from, the line carries its tag:
   [D13] exact normals by trilinear weights (--normals fd: as printed); curvature where a ray ends
   [D14] the mask learns every few steps, by a logistic surrogate, from averaged errors of photos
 """
-import argparse, datetime, functools, io, json, math, os, resource, shutil, subprocess, sys, time
+import argparse, datetime, functools, gc, io, json, math, os, resource, shutil, subprocess, sys, time
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import NamedTuple
@@ -1446,3 +1446,4 @@ if __name__ == "__main__":
     run_command_line(main)
     if RANKS > 1:
         dist.destroy_process_group()
+        gc.collect()  # a cycle that holds the group would keep its threads, and exit would abort
