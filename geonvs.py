@@ -36,7 +36,8 @@ Where the printed paper is departed from, the line carries its tag:
   [D13] exact normals by trilinear weights (--normals fd: as printed); curvature where a ray ends
   [D14] the mask learns every few steps, by a logistic surrogate, from averaged errors of photos
 """
-import argparse, datetime, functools, gc, io, json, math, os, resource, shutil, subprocess, sys, time
+import argparse, datetime, functools, gc, io, json, math, os
+import resource, shutil, subprocess, sys, time
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import NamedTuple
