@@ -1428,9 +1428,13 @@ def main(argv: list[str] | None = None) -> None:
 
 
 def run_command_line(entry) -> None:
-    """Exit code 0, or 2 with one sentence on stderr."""
+    """Exit code 0, or 2 with one sentence on stderr. Several processes part in the end."""
     try:
-        return entry()
+        entry()
+        if dist.is_initialized():
+            dist.destroy_process_group()
+            gc.collect()  # a cycle that holds the group would keep its threads: exit would abort
+        return
     except UserError as error:
         message = str(error)
     except torch.OutOfMemoryError:
@@ -1438,13 +1442,10 @@ def run_command_line(entry) -> None:
     except OSError as error:  # a full disk, a folder without permission
         message = f"{error}: free or choose a place, then go on with --resume"
     except KeyboardInterrupt:
-        message = "stopped; --resume goes on from the last checkpoint, there is one every minute"
+        message = "stopped; a checkpoint is made every minute, --resume goes on from the last one"
     print(f"error: {message}", file=sys.stderr)
     sys.exit(2)
 
 
 if __name__ == "__main__":
     run_command_line(main)
-    if RANKS > 1:
-        dist.destroy_process_group()
-        gc.collect()  # a cycle that holds the group would keep its threads, and exit would abort

@@ -2123,7 +2123,7 @@ def test_two_processes_train_one_model_on_the_rays_of_both(tmp_path, monkeypatch
         free.bind(("127.0.0.1", 0))
         env = dict(MASTER_ADDR="127.0.0.1", MASTER_PORT=str(free.getsockname()[1]), WORLD_SIZE="2",
                    GLOO_SOCKET_IFNAME="lo0" if sys.platform == "darwin" else "lo")
-    pair = [child("t.together(); t.g.dist.destroy_process_group(); t.g.gc.collect()", tmp_path / "pair", RANK=rank, LOCAL_RANK=rank, **env) for rank in "01"]
+    pair = [child("t.g.run_command_line(t.together)", tmp_path / "pair", RANK=rank, LOCAL_RANK=rank, **env) for rank in "01"]
     monkeypatch.chdir(tmp_path / "alone")
     together()
     (said, errors), (silence, more) = (process.communicate(timeout=300) for process in pair)
