@@ -445,46 +445,7 @@ class LipschitzMLP(nn.Module):
         return x
 
 
-def contract(x: Tensor) -> Tensor:
-    """Squeezes |x| > 1 into the ball of radius 2 (mip-NeRF 360 Eq. 10); identity inside."""
-    inverse = x.norm(dim=-1, keepdim=True).clamp(min=1).reciprocal()  # (...,1) 1 / |x|
-    return x * (2 - inverse) * inverse
-
-
-class Background(nn.Module):
-    """A small NeRF before the sphere and beyond it, on an octree over contracted space."""
-    def __init__(self, octree: Octree, hidden: int, per_ray: int):
-        super().__init__()
-        self.octree = octree
-        inputs = 3 + octree.features.shape[1] * octree.levels
-        self.density, self.color = (
-            nn.Sequential(nn.Linear(a, hidden), nn.ReLU(), nn.Linear(hidden, b))
-            for a, b in ((inputs, 1 + GEO), (GEO + per_ray, 3)))
-
-    def forward(self, rays: Rays, t0: Tensor, t1: Tensor, per_ray: Tensor, jitter: Tensor):
-        """Colour (R,3) from near to t0 (R,), the share (R,) that passes it, and of that the colour
-        (R,3) beyond t1 (R,). per_ray: (R,9+A) direction and code; jitter: (R,S) in 0..1. [D8] A
-        third of the S sections are equal and end at t0; the others are equal steps of u in
-        t = t1 + u / (1 - u), and the last is opaque."""
-        (R, S), n = jitter.shape, jitter.shape[1] // 3
-        at, dt = torch.arange(S, device=t0.device) + jitter, (t0 - rays.near)[:, None] / n  # (R,1)
-        before = torch.addcmul(rays.near[:, None], dt, at[:, :n])  # (R,n)
-        u = (at[:, n:] - n) / (S - n)  # (R,S-n)
-        beyond = torch.addcdiv(t1[:, None], u, (1 - u).clamp(min=1e-3))  # (R,S-n)
-        x = contract(rays.at(torch.cat([before, beyond], 1))).reshape(-1, 3)  # (RS,3)
-        feat = torch.cat([x, self.octree(x).flatten(1)], 1)  # (RS,3+LC)
-        density, geo = self.density(feat).split([1, GEO], 1)  # (RS,1), (RS,GEO)
-        inputs = torch.cat([geo, per_ray.repeat_interleave(S, 0)], 1)  # (RS,GEO+9+A)
-        rgb = self.color(inputs).sigmoid().reshape(R, S, 3)  # (R,S,3)
-        sigma = F.softplus(density.reshape(R, S) - 1)[:, :-1]  # (R,S-1)
-        dt = torch.cat([dt.expand(-1, n), torch.diff(beyond)], 1)  # (R,S-1)
-        alpha = F.pad(-torch.expm1(-sigma * dt), (0, 1), value=1.0)  # (R,S) [D8]
-        w, _ = composite(alpha)  # (R,S), section 5
-        front, behind = (w[:, :, None] * rgb).split([n, S - n], 1)
-        return front.sum(1), 1 - w[:, :n].sum(1), behind.sum(1)  # (R,3), (R,), (R,3)
-
-
-# ---- 5 From SDF to colour: sections along the ray, alpha, compositing ----------------------------
+# ---- 5 From SDF to colour: alpha, compositing, samples, background -------------------------------
 
 class Deviation(nn.Module):
     """The deviation network: zeta = exp(10 v), one learned number; 1/zeta is a surface's width."""
@@ -570,6 +531,45 @@ class SDFCache(nn.Module):
         weight = torch.add(weight + 1e-5, weight.sum(1, keepdim=True),
                            alpha=FLOOR / (1 - FLOOR) / PROBES)  # (R,N)
         return torch.cat([t0, inverse_cdf(probes, weight, u), t1], 1)  # (R,S+1)
+
+
+def contract(x: Tensor) -> Tensor:
+    """Squeezes |x| > 1 into the ball of radius 2 (mip-NeRF 360 Eq. 10); identity inside."""
+    inverse = x.norm(dim=-1, keepdim=True).clamp(min=1).reciprocal()  # (...,1) 1 / |x|
+    return x * (2 - inverse) * inverse
+
+
+class Background(nn.Module):
+    """A small NeRF before the sphere and beyond it, on an octree over contracted space."""
+    def __init__(self, octree: Octree, hidden: int, per_ray: int):
+        super().__init__()
+        self.octree = octree
+        inputs = 3 + octree.features.shape[1] * octree.levels
+        self.density, self.color = (
+            nn.Sequential(nn.Linear(a, hidden), nn.ReLU(), nn.Linear(hidden, b))
+            for a, b in ((inputs, 1 + GEO), (GEO + per_ray, 3)))
+
+    def forward(self, rays: Rays, t0: Tensor, t1: Tensor, per_ray: Tensor, jitter: Tensor):
+        """Colour (R,3) from near to t0 (R,), the share (R,) that passes it, and of that the colour
+        (R,3) beyond t1 (R,). per_ray: (R,9+A) direction and code; jitter: (R,S) in 0..1. [D8] A
+        third of the S sections are equal and end at t0; the others are equal steps of u in
+        t = t1 + u / (1 - u), and the last is opaque."""
+        (R, S), n = jitter.shape, jitter.shape[1] // 3
+        at, dt = torch.arange(S, device=t0.device) + jitter, (t0 - rays.near)[:, None] / n  # (R,1)
+        before = torch.addcmul(rays.near[:, None], dt, at[:, :n])  # (R,n)
+        u = (at[:, n:] - n) / (S - n)  # (R,S-n)
+        beyond = torch.addcdiv(t1[:, None], u, (1 - u).clamp(min=1e-3))  # (R,S-n)
+        x = contract(rays.at(torch.cat([before, beyond], 1))).reshape(-1, 3)  # (RS,3)
+        feat = torch.cat([x, self.octree(x).flatten(1)], 1)  # (RS,3+LC)
+        density, geo = self.density(feat).split([1, GEO], 1)  # (RS,1), (RS,GEO)
+        inputs = torch.cat([geo, per_ray.repeat_interleave(S, 0)], 1)  # (RS,GEO+9+A)
+        rgb = self.color(inputs).sigmoid().reshape(R, S, 3)  # (R,S,3)
+        sigma = F.softplus(density.reshape(R, S) - 1)[:, :-1]  # (R,S-1)
+        dt = torch.cat([dt.expand(-1, n), torch.diff(beyond)], 1)  # (R,S-1)
+        alpha = F.pad(-torch.expm1(-sigma * dt), (0, 1), value=1.0)  # (R,S) [D8]
+        w, _ = composite(alpha)  # (R,S)
+        front, behind = (w[:, :, None] * rgb).split([n, S - n], 1)
+        return front.sum(1), 1 - w[:, :n].sum(1), behind.sum(1)  # (R,3), (R,), (R,3)
 
 
 def render_rays(model: "GeoNVS", rays: Rays, code: Tensor, jitter: Tensor) -> dict[str, Tensor]:

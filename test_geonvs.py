@@ -1255,42 +1255,7 @@ def test_lipschitz_mlp_is_an_mlp_whose_long_rows_are_cut_to_the_bound_that_it_ke
         assert math.isfinite(loss.item()) and all(torch.isfinite(p.grad).all() for p in mlp.parameters())
 
 
-def test_contract_is_identity_inside_below_two_outside_monotone_and_finite_with_its_gradient():
-    d, r = F.normalize(random(50, 1, 3, low=-1), dim=2), torch.tensor([0.0, 0.3, 1 - 1e-6, 1, 1 + 1e-6, 2, 10, 1e6])
-    y, r = g.contract(d * r[:, None]), r.double()
-    close(y, torch.where(r < 1, r, 2 - 1 / r)[:, None] * d)
-    assert (y.norm(dim=2) < 2).all() and (y.norm(dim=2).diff(dim=1) > 0).all()
-    x = torch.tensor([0, 1e-30, 1e-3, 1, 30, 1e4, 1e15])[:, None] * torch.tensor([0.6, 0, -0.8])
-    g.contract(x.requires_grad_()).sum().backward()
-    assert torch.isfinite(x.grad).all() and (g.contract(x).norm(dim=1) <= 2).all()
-
-
-def test_background_equals_naive_loops_over_its_sections_before_and_beyond_the_sphere():
-    bg, n, want = g.Background(fill(g.Octree(2.0, 1, 2, root=4)), 16, 12), 4, []
-    rays = sphere_rays([(0.3, 0.2, -3), (0, 2, 0)], [(0, 0.1, 1), (1, 0, 0.3)])
-    t0, t1, jitter = torch.tensor([2.0, 0.1]), torch.tensor([3.0, 0.5]), random(2, n + 2, seed=4, dtype=torch.float32)
-    per_ray, jitter[1, -1] = random(2, 12, seed=5, dtype=torch.float32), 1.0  # its last is at infinity
-    for i in range(2):
-        length = (t0[i].item() - 0.1) / 2  # of the two sections before; the second ray has nothing there
-        before = [0.1 + length * (j + jitter[i, j].item()) for j in range(2)]
-        u = [(j + jitter[i, 2 + j].item()) / n for j in range(n)]
-        beyond = [t1[i].item() + v / max(1 - v, 1e-3) for v in u]
-        for t, steps in ((before, [length] * 2), (beyond, [*np.diff(beyond), math.inf])):
-            rgb, left = torch.zeros(3), 1.0 if t is before else left
-            for at, dt in zip(t, steps):
-                x = g.contract(rays.o[i] + at * rays.d[i])
-                out = bg.density(torch.cat([x, bg.octree(x[None]).flatten()]))
-                opacity = 1 - math.exp(-math.log1p(math.exp(out[0].item() - 1)) * dt)
-                rgb = rgb + left * opacity * torch.sigmoid(bg.color(torch.cat([out[1:], per_ray[i]])))
-                left *= 1 - opacity
-            want.append(torch.cat([rgb, torch.tensor([left])]))
-    front, passes, behind = bg(rays, t0, t1, per_ray, jitter)
-    close(torch.cat([front, passes[:, None]], 1), torch.stack(want[::2]), atol=1e-5)
-    close(behind, torch.stack(want[1::2])[:, :3], atol=1e-5)
-    assert passes[0] < 0.9 and passes[1] == 1
-
-
-# ---- 5 alpha, compositing, sampling --------------------------------------------------------------
+# ---- 5 alpha, compositing, sampling, background --------------------------------------------------
 
 def sigmoid(x):
     return 1 / (1 + math.exp(-x))
@@ -1448,6 +1413,41 @@ def test_rendering_a_known_ball_finds_its_depth_normal_and_silhouette(mode):
     close(out["opacity"][hit | miss], hit[hit | miss], atol=0.01)
     close(out["normal"][hit], F.normalize(out["x"][hit] - CENTRE, dim=1), atol=0.05)
     close(out["rgb"][hit | miss], torch.where(hit[:, None], 0.5, model.bg_color)[hit | miss], atol=5e-3)
+
+
+def test_contract_is_identity_inside_below_two_outside_monotone_and_finite_with_its_gradient():
+    d, r = F.normalize(random(50, 1, 3, low=-1), dim=2), torch.tensor([0.0, 0.3, 1 - 1e-6, 1, 1 + 1e-6, 2, 10, 1e6])
+    y, r = g.contract(d * r[:, None]), r.double()
+    close(y, torch.where(r < 1, r, 2 - 1 / r)[:, None] * d)
+    assert (y.norm(dim=2) < 2).all() and (y.norm(dim=2).diff(dim=1) > 0).all()
+    x = torch.tensor([0, 1e-30, 1e-3, 1, 30, 1e4, 1e15])[:, None] * torch.tensor([0.6, 0, -0.8])
+    g.contract(x.requires_grad_()).sum().backward()
+    assert torch.isfinite(x.grad).all() and (g.contract(x).norm(dim=1) <= 2).all()
+
+
+def test_background_equals_naive_loops_over_its_sections_before_and_beyond_the_sphere():
+    bg, n, want = g.Background(fill(g.Octree(2.0, 1, 2, root=4)), 16, 12), 4, []
+    rays = sphere_rays([(0.3, 0.2, -3), (0, 2, 0)], [(0, 0.1, 1), (1, 0, 0.3)])
+    t0, t1, jitter = torch.tensor([2.0, 0.1]), torch.tensor([3.0, 0.5]), random(2, n + 2, seed=4, dtype=torch.float32)
+    per_ray, jitter[1, -1] = random(2, 12, seed=5, dtype=torch.float32), 1.0  # its last is at infinity
+    for i in range(2):
+        length = (t0[i].item() - 0.1) / 2  # of the two sections before; the second ray has nothing there
+        before = [0.1 + length * (j + jitter[i, j].item()) for j in range(2)]
+        u = [(j + jitter[i, 2 + j].item()) / n for j in range(n)]
+        beyond = [t1[i].item() + v / max(1 - v, 1e-3) for v in u]
+        for t, steps in ((before, [length] * 2), (beyond, [*np.diff(beyond), math.inf])):
+            rgb, left = torch.zeros(3), 1.0 if t is before else left
+            for at, dt in zip(t, steps):
+                x = g.contract(rays.o[i] + at * rays.d[i])
+                out = bg.density(torch.cat([x, bg.octree(x[None]).flatten()]))
+                opacity = 1 - math.exp(-math.log1p(math.exp(out[0].item() - 1)) * dt)
+                rgb = rgb + left * opacity * torch.sigmoid(bg.color(torch.cat([out[1:], per_ray[i]])))
+                left *= 1 - opacity
+            want.append(torch.cat([rgb, torch.tensor([left])]))
+    front, passes, behind = bg(rays, t0, t1, per_ray, jitter)
+    close(torch.cat([front, passes[:, None]], 1), torch.stack(want[::2]), atol=1e-5)
+    close(behind, torch.stack(want[1::2])[:, :3], atol=1e-5)
+    assert passes[0] < 0.9 and passes[1] == 1
 
 
 @pytest.mark.parametrize("alpha", ["neus", "printed"])
