@@ -99,7 +99,7 @@ def read_scene(path):
         need(min(scene["footprint"], scene["scale"]) > 0 and not scene["is_test"].all(), "scale")
         need({"kind", "downscale", "folder", "split"} <= {*json.loads(str(scene["info"]))}, "info")
     except Exception as e:   # a damaged file can fail in any layer: zip, array header, dtype, text
-        raise UserError(f"{path} is no whole scene of this version: delete it, it is remade") from e
+        raise UserError(f"{path} is no whole scene, or too large: delete it, it is remade") from e
     return scene
 
 
@@ -532,15 +532,15 @@ def scene_path(name_or_folder):
 
 
 def open_scene(name_or_folder, downscale=2):
-    """Scene from its file: made on first use, and anew if its photos, poses or split changed."""
+    """Scene from its file: made on first use, and anew if photos, poses or split are newer."""
     path, is_toy, split = scene_path(name_or_folder), name_or_folder == "toy", None
     if path.exists():
         scene, made = read_scene(path), path.stat().st_mtime
         info = json.loads(str(scene["info"]))
         split, folder = info["split"], Path(info["folder"] or "")   # split: named once, by --split
-        tables = [Path(split)] if split else folder.glob("[!.]*.tsv")
-        newer = (file for file in itertools.chain(tables, folder.glob("**/images*"))
-                 if file.exists() and file.stat().st_mtime > made)
+        inside = map(folder.glob, ("[!.]*.tsv", "**/images*", "**/images/**/*"))
+        files = itertools.chain([Path(split or folder)], *inside)
+        newer = (p for p in files if p.exists() and p.stat().st_mtime > made)
         if is_toy or info["downscale"] == downscale and not any(newer):
             return scene
     print(f"making {path}")
@@ -598,7 +598,7 @@ def download(name, archive_url=ARCHIVE_URL, split_url=SPLIT_URL):
 def run_sfm(folder):
     """Poses for the raw photos in `folder`, by pycolmap -> folder/dense/{images,sparse}"""
     import pycolmap   # an extra: main says when it is not there
-    need(folder.is_dir() and not (folder / "dense").exists(), f"{folder} is missing, or was posed")
+    need(folder.is_dir() and not (folder / "dense").exists(), f"{folder} is missing, or has dense/")
     database, models = folder / "database.db", folder / "models"
     models.mkdir(exist_ok=True)
     pycolmap.extract_features(database, folder)
@@ -623,8 +623,8 @@ def main(argv=None):
     given = vars(p.parse_args(argv))
     name, fetch_first, sfm_first = (given.pop(key, None) for key in ("scene", "download", "sfm"))
     make, path = make_toy if name == "toy" else prepare, scene_path(name)
-    wrong = given.keys() - inspect.signature(make).parameters
     try:
+        wrong = given.keys() - inspect.signature(make).parameters
         need(not wrong, f"--{' --'.join(wrong)}: not for {name}")
         fetch_first and download(name)
         sfm_first and run_sfm(Path(name))

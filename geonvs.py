@@ -22,7 +22,7 @@ Conventions
 Where the printed paper is departed from, the line carries its tag:
   [D1]  alpha is divided by sigmoid(zeta s_prev) and never negative (printed: a wall is 63 % opaque)
   [D2]  the slope correction sits inside zeta, with opposite signs for the two ends of a section
-  [D3]  Phi: NeuS-weighted E_grad, |lap| eps, calibrated by quantiles, detached, times opacity
+  [D3]  Phi: NeuS-weighted E_grad, |lap| eps opacity, set by quantiles, detached, times opacity
   [D4]  the curvature loss is |lap| eps opacity: |lap| of a trilinear field grows as eps shrinks
   [D5]  the Lipschitz term is a sum of logs, not a product that can drown the colour at first
   [D6]  CGNet: GroupNorm, ReLU, half width, a block a stage, no residual, low bias, finer head
@@ -67,7 +67,6 @@ def opt(default, text, *choices):
 @dataclass
 class Config:
     """All settings. [R]: a value that the paper leaves open, as predecessors recommend it."""
-
     scene: str = opt("toy", "synthetic, or of Phototourism", "toy", *data_prep.SCENES)
     data: str = opt("", "an IMC-PT or COLMAP folder instead of a named scene")
     name: str = opt("", "run folder below runs/ (default: scene-method-seed)")
@@ -77,12 +76,12 @@ class Config:
     minutes: float = opt(0.0, "training budget in minutes, instead of --steps if above 0")
     downscale: int = opt(2, "integer factor by which photos are made smaller (benchmarks use 2)")
     rays: int = opt(512, "rays per step, of all processes together")
-    photos: int = opt(8, "photos per step; a lesson of the mask shows them whole")
+    photos: int = opt(8, "photos per step, of each process; a lesson of the mask shows them whole")
     samples: int = opt(16, "foreground samples per ray")
     bg_samples: int = opt(24, "background samples per ray, a third of them before the sphere")
     levels: int = opt(0, "octree levels, 0: from the pixel footprint at the surface")
     grid: str = opt("octree", "uniform: the same finest cell everywhere", "octree", "uniform")
-    max_mb: float = opt(1000.0, "up to which octree and Adam's moments may grow, MiB")
+    max_mb: float = opt(1000.0, "up to which the foreground's octree and its moments grow, MiB")
     hidden: int = opt(64, "width of the MLPs")
     appearance_dim: int = opt(16, "length of a photo's appearance code")
     appearance: str = opt("auto", "codes; auto: on if exposures differ", "auto", "on", "off")
@@ -110,7 +109,7 @@ class Config:
             is_right = isinstance(value, str) if f.type is str else low <= value < 2 ** 63
             need(is_right and value in (f.metadata["choices"] or [value]),
                  f"--{f.name} {value} makes no sense: use a number from {low}, or see --help")
-        need(self.levels <= 9, "--levels goes up to 9: 4096 cells a side")
+        need(self.levels <= 8, "--levels goes up to 8: 2048 cells a side")
         need(self.rays % self.photos == 0, "--rays must be a multiple of --photos")
 
     @property
@@ -127,7 +126,6 @@ LARGE = dict(steps=300_000, rays=4096, photos=16, samples=32, appearance_dim=32)
 
 class Scene(NamedTuple):
     """The arrays of a scene file (data_prep.py documents them) as tensors on the device."""
-
     rgb: Tensor  # (N,3) uint8, all pixels of all photos
     start: Tensor  # (I+1,) first pixel of each photo
     wh: Tensor  # (I,2) width, height in px
@@ -162,7 +160,6 @@ def load_scene(raw: dict, device="cpu") -> Scene:
 
 class Rays(NamedTuple):
     """A batch of rays; every field is indexed by the ray."""
-
     o: Tensor  # (R,3) origin
     d: Tensor  # (R,3) unit direction
     near: Tensor  # (R,)
@@ -235,8 +232,7 @@ class Octree(nn.Module):
     is a dense grid of root^3 cells; a node points to its first of eight children. Nodes 0-7 are the
     null block: a leaf's children, and their own. Features live on corners, shared by the cells that
     meet there. A corner with a missing cell around it ("hanging") is pinned to zero: the field is
-    continuous across the borders of refined regions. A query concatenates the trilinear features of
-    all levels on its path; absent levels contribute zeros."""
+    continuous across the borders of refined regions. Levels that a place lacks are zeros there."""
     def __init__(self, half: float, levels: int, channels: int = 4, device="cpu", root: int = 16):
         super().__init__()
         self.half, self.levels, self.root = half, levels, root
@@ -282,11 +278,10 @@ class Octree(nn.Module):
         row = torch.where(free, PINNED - 1 + free.cumsum(0), keys % PINNED)  # (Q,)
         null = torch.arange(PINNED, device=row.device).reshape(8, 8)  # rows of the null block
         self.corner = torch.cat([null, row[inverse]]).int()  # (8+N,8)
-        row_key = torch.cat([self.row_key[:PINNED], keys[free]])  # (V,)
-        old_row = torch.searchsorted(self.row_key, row_key).clamp(max=len(self.row_key) - 1)
-        old_row = torch.where(self.row_key[old_row] == row_key, old_row, 0)  # (V,)
+        old_key, self.row_key = self.row_key, torch.cat([self.row_key[:PINNED], keys[free]])  # (V,)
+        old_row = torch.searchsorted(old_key, self.row_key).clamp(max=len(old_key) - 1)
+        old_row = torch.where(old_key[old_row] == self.row_key, old_row, 0)  # (V,)
         self.features = nn.Parameter(self.features.detach()[old_row])  # (V,C)
-        self.row_key = row_key
         return old_row
 
     def split(self, cells: Tensor) -> None:
@@ -345,8 +340,8 @@ def refined_keys(octree: Octree, sdf, hits: Tensor, zeta: float, max_mb: float) 
     """Split keys that fit the octree to the scene. sdf: (P,3) to (P,); hits (P,5): where recent
     rays ended, their error, a pixel's size there; 2 where none was. A cell at the surface is split
     if enough rays end in it, they miss their colour, and the children are not finer than pixels;
-    worst first, as far as max_mb allows. It is merged if nothing of it, nor within its side, is
-    nearer to the surface than HIDDEN / zeta, from where on the field is hardly seen."""
+    worst first, as far as max_mb allows. It is merged if hardly anything is seen of it and within
+    its side."""
     is_inside = hits[:, :3].norm(dim=1) < 1  # (P,) rays that miss the sphere split no cells
     if not is_inside.any():
         return octree.split_keys
@@ -387,8 +382,7 @@ class SDFField(nn.Module):
 
     def forward(self, x: Tensor, with_gradient: bool = False) -> tuple[Tensor, Tensor, Tensor]:
         """sdf (P,), geometry (P,G) and, if wanted, grad s (P,3) at x (P,3) [D13]: the chain rule
-        written out, ds/dx = ds/dz dz/dx with z = [x, features(x)], needs no second-order autograd.
-        """
+        by hand, ds/dx = ds/dz dz/dx with z = [x, features(x)], needs no second-order autograd."""
         feat = self.octree(x, with_gradient)  # (P,L,1 or 4,C)
         value, slope = feat.split([1, feat.shape[2] - 1], 2)  # (P,L,1,C), (P,L,0 or 3,C)
         h = self.lin1(torch.cat([x, value.flatten(1)], 1))  # (P,H)
@@ -416,11 +410,6 @@ def finite_differences(s: Tensor, eps: float) -> tuple[Tensor, Tensor]:
     """Gradient (P,3) and Laplacian (P,) from s (P,5) at the taps (Neuralangelo)."""
     k, mean = (resident(c, s.device).to(s.dtype) for c in (TAPS, MEAN))  # (5,3), (5,)
     return 0.75 / eps * (s @ k), 6 / eps ** 2 * (s @ mean)  # as sum k k^T is 4/3 of the identity
-
-
-def direction_basis(d: Tensor) -> Tensor:
-    """Polynomials up to degree 2 of unit directions (R,3), which span spherical harmonics: (R,9)"""
-    return torch.cat([d, d * d, d * d.roll(1, 1)], 1)
 
 
 class LipschitzMLP(nn.Module):
@@ -541,10 +530,11 @@ def contract(x: Tensor) -> Tensor:
 
 class Background(nn.Module):
     """A small NeRF before the sphere and beyond it, on an octree over contracted space."""
-    def __init__(self, octree: Octree, hidden: int, per_ray: int):
+    def __init__(self, points: Tensor, hidden: int, per_ray: int):
         super().__init__()
-        self.octree = octree
-        inputs = 3 + octree.features.shape[1] * octree.levels
+        self.octree = Octree(2.0, levels=5, device=points.device)
+        seed_octree(self.octree, contract(points), 1, 3)  # three levels only near SfM points (K,3)
+        inputs = 3 + self.octree.features.shape[1] * self.octree.levels
         self.density, self.color = (
             nn.Sequential(nn.Linear(a, hidden), nn.ReLU(), nn.Linear(hidden, b))
             for a, b in ((inputs, 1 + GEO), (GEO + per_ray, 3)))
@@ -592,7 +582,8 @@ def render_rays(model: "GeoNVS", rays: Rays, code: Tensor, jitter: Tensor) -> di
     opacity_of = neus_alpha if cfg.alpha == "neus" else printed_alpha
     alpha = opacity_of(sdf.reshape(R, S), cos, torch.diff(edges), zeta)  # (R,S)
     w, trans = composite(alpha)  # (R,S), (R,); 0 and 1 where a ray misses: no section has a length
-    per_ray = torch.cat([direction_basis(rays.d), code], 1)  # (R,9+A)
+    d = rays.d  # its polynomials up to degree 2 span the spherical harmonics
+    per_ray = torch.cat([d, d * d, d * d.roll(1, 1), code], 1)  # (R,9+A)
     inputs = torch.cat([geo, normal, per_ray.repeat_interleave(S, 0)], 1)  # (RS,G+3+9+A)
     rgb = torch.einsum("rs,rsc->rc", w, model.color(inputs).sigmoid().reshape(R, S, 3))  # (R,3)
     if model.background is None:
@@ -602,7 +593,7 @@ def render_rays(model: "GeoNVS", rays: Rays, code: Tensor, jitter: Tensor) -> di
     eikonal = ((length - 1) ** 2).reshape(R, S) * (t1 > t0)[:, None]  # a miss has none
     with torch.no_grad():
         depth = torch.addcmul(torch.einsum("rs,rs->r", w, t), trans, t1)  # (R,)
-        seen = dict(opacity=1 - trans, depth=depth, x=rays.at(depth[:, None])[:, 0],
+        seen = dict(opacity=(1 - trans).clamp(min=0), depth=depth, x=rays.at(depth[:, None])[:, 0],
                     normal=torch.einsum("rs,rsi->ri", w, normal.reshape(R, S, 3)),
                     e_grad=torch.einsum("rs,rs->r", w, eikonal))  # NeuS-weighted [D3]
     rgb = front + passes[:, None] * rgb + trans[:, None] * behind  # (R,3)
@@ -667,8 +658,7 @@ LAM_GRAD, LAM_LAP = 10.0, 2.0  # lambda_grad and lambda_curv inside Phi (paper)
 
 def edge_indicator(bend: Tensor, calibration=(0.0, 1.0)) -> Tensor:
     """Phi of bend = lambda_grad E_grad + lambda_curv E_curv, any shape. Eq. 4 calibration: centre
-    and width of the sigmoid [D3]; 0 and 1 are the literal reading, by which Phi lies between 0.5
-    and 1 for every ray, a price that tells no edge."""
+    and width of the sigmoid [D3]; 0 and 1 are the literal reading: Phi is over 0.5 on all rays."""
     return torch.sigmoid((bend - calibration[0]) / calibration[1])
 
 
@@ -707,8 +697,7 @@ class TransientMask(nn.Module):
         """Keeps residual (R,3), bend and opacity (R,) where the network will look for them."""
         m = self.seen.shape[-1]
         col, row = (rays.uv * m).long().unbind(1)  # (R,)
-        seen = opacity.clamp(min=0)  # (R,) as printed it may be negative, which would say: no ray
-        found = torch.cat([residual, bend[:, None], seen[:, None]], 1)  # (R,5)
+        found = torch.cat([residual, bend[:, None], opacity[:, None]], 1)  # (R,5)
         self.seen[rays.img, :, row, col] = found.nan_to_num(0, 0, 0)
 
     def calibrate(self, bend: Tensor, rate: float = 0.2) -> None:
@@ -764,9 +753,7 @@ SHARP = 40.0  # zeta from which on SfM points pull with their full weight; at fo
 class GeoNVS(nn.Module):
     """The paper's model: it assembles the parts above and sums their losses. What stands from
     `losses` on is what training and scoring ask of any model; rivals in the tests answer too."""
-
     name, terms = "geonvsw", ("rgb", "eik", "curv", "lps", "off", "sfm")  # of Eq. 5 but for M's
-    bg_levels = 5  # octree levels of the background, the last three only near SfM points
     adam = dict(betas=(0.9, 0.99), eps=1e-15)  # as is usual for feature grids (Instant-NGP)
 
     def __init__(self, cfg: Config, scene: Scene):
@@ -788,11 +775,8 @@ class GeoNVS(nn.Module):
         self.appearance = nn.Embedding(len(scene.wh), A).requires_grad_(A > 0)  # at 0 CUDA errs
         nn.init.normal_(self.appearance.weight, std=0.01)
         self.color = LipschitzMLP([GEO + self.sdf.features + 3 + 9 + A, cfg.hidden, cfg.hidden, 3])
-        self.background = None
-        if has_field:
-            outer = Octree(2.0, self.bg_levels, device=dev)
-            seed_octree(outer, contract(scene.points[~inside]), 1, self.bg_levels - 2)
-            self.background = Background(outer, cfg.hidden, 9 + A)
+        outer = scene.points[~inside]  # (K,3)
+        self.background = Background(outer, cfg.hidden, 9 + A) if has_field else None
         self.deviation, self.mask = Deviation(), TransientMask(cfg, scene)
         self.cache = SDFCache(int(np.clip(octree.root << levels - 1, 64, 128)))
         self.bg_color = nn.Buffer(torch.as_tensor(raw["bg_color"]).float().nan_to_num(0.5))
@@ -997,10 +981,17 @@ def training_step(model, optimizer, photos: Tensor, state: dict, progress: float
     return terms, is_void
 
 
+def facts(model) -> list:
+    """What a checkpoint must share with the scene and settings that it is read for."""
+    raw, cfg = model.scene.raw, model.cfg
+    return [str(raw["info"]), *(raw[k].tolist() for k in ("name", "is_test", "scale", "center")),
+            cfg.grid, cfg.gpl]
+
+
 def save_checkpoint(path: Path, model, optimizer, gen, state: dict) -> None:
     buffer = io.BytesIO()  # as torch.save calls a full disk a RuntimeError
     torch.save(dict(config=asdict(model.cfg), model=model.state_dict(), rng=gen.get_state(),
-                    optimizer=optimizer.state_dict(), state=state,
+                    optimizer=optimizer.state_dict(), state=state, facts=facts(model),
                     octrees=[o.split_keys for o in octrees_of(model)]), buffer)
     atomic_write(path, lambda tmp: tmp.write_bytes(buffer.getbuffer()))
 
@@ -1024,6 +1015,7 @@ def read_checkpoint(path: Path, given: dict) -> tuple[dict, Config]:
 def restore(saved: dict, path: Path, model, gen=None) -> torch.optim.Adam:
     """Puts a checkpoint's weights into a model, its state into gen; returns its optimiser."""
     try:
+        need(saved["facts"] == facts(model), "another scene or split")
         for octree, keys in zip(octrees_of(model), saved["octrees"], strict=True):
             octree.build(keys.to(octree.features.device))
         model.load_state_dict(saved["model"])
@@ -1084,9 +1076,10 @@ def train(cfg: Config, scene: Scene, run: Path, saved: dict | None = None, kind=
             break
         terms, is_void = training_step(model, optimizer, photos, state, progress, gen)
         dropped, streak = dropped + is_void, (streak + 1) * is_void
-        if state["refined"] < len(REFINE_AT) and progress >= REFINE_AT[state["refined"]]:
-            state["refined"] += 1
-            model.follow(agreed(RANK or model.plan(state["refined"] == len(REFINE_AT))), optimizer)
+        due = sum(progress >= share for share in REFINE_AT)
+        if state["refined"] != due:  # or fewer: resumed with a larger budget
+            state["refined"] = due
+            model.follow(agreed(RANK or model.plan(due == len(REFINE_AT))), optimizer)
     need(not has_diverged, f"{int(streak)} steps in a row had no finite loss: mend poses, or try a "
          f"third of the learning rates --lr_grid, --lr_net; {path} holds the last good weights")
     return model, state
@@ -1372,7 +1365,8 @@ def pick_device(name: str) -> torch.device:
     count = torch.cuda.device_count() if torch.cuda.is_available() else 0
     names = ["cpu", *(f"cuda:{i}" for i in range(count))]
     chosen = ("cuda" if count else "cpu") if name == "auto" else name
-    chosen = f"cuda:{LOCAL_RANK}" if chosen == "cuda" else chosen
+    if chosen == "cuda" or RANKS > 1 and chosen in names[1:]:
+        chosen = f"cuda:{LOCAL_RANK}"
     need(chosen in names, f"--device {name} is not there: this machine has {', '.join(names)}")
     return torch.device(chosen)
 
@@ -1384,13 +1378,11 @@ def make_config(given: dict) -> Config:
     return Config(**(LARGE if has_gpu and not is_toy else {}) | given)
 
 
-def execute(cfg: Config, arrays: dict, run: Path, saved: dict | None = None, kind=GeoNVS) -> dict:
-    """Trains and scores one model on the dictionary of a scene file; returns its metrics."""
-    device = pick_device(cfg.device)
-    scene = load_scene(arrays, device)
+def execute(cfg: Config, scene: Scene, run: Path, saved: dict | None = None, kind=GeoNVS) -> dict:
+    """Trains and scores one model; returns its metrics."""
     run.mkdir(parents=True, exist_ok=True)
-    print(f"{kind.name} on {scene.info['scene']}: {len(scene.wh)} photos "
-          f"({len(scene.photos(True))} held out), {len(scene.rgb):,} pixels; {device}; {run}/")
+    print(f"{kind.name} on {scene.info['scene']}: {len(scene.wh)} photos ({len(scene.photos(True))}"
+          f" held out), {len(scene.rgb):,} pixels; {scene.c2w.device}; {run}/")
     model, state = train(cfg, scene, run, saved, kind)
     metrics = agreed(RANK or finish(model, scene, state, run))
     print("".join(f"  {k} {v:.4g}" for k, v in metrics.items() if isinstance(v, float)))
@@ -1417,14 +1409,13 @@ def main(argv: list[str] | None = None) -> None:
         sys.stdout = open(os.devnull, "w") if RANK else sys.stdout
     opened = functools.cache(data_prep.open_scene)
     agreed(RANK or bool(opened(cfg.source, cfg.downscale)))  # the first makes the file
-    arrays = opened(cfg.source, cfg.downscale)
+    scene = load_scene(opened(cfg.source, cfg.downscale), device)
     if render:
-        scene = load_scene(arrays, device)
         model = GeoNVS(cfg, scene)
         restore(saved, run / "checkpoint.pt", model)
         RANK or film(model, scene, run / "film.mp4")
     else:
-        execute(cfg, arrays, run, saved)
+        execute(cfg, scene, run, saved)
 
 
 def run_command_line(entry) -> None:
@@ -1437,8 +1428,8 @@ def run_command_line(entry) -> None:
         return
     except UserError as error:
         message = str(error)
-    except torch.OutOfMemoryError:
-        message = "the GPU's memory is full: lower --samples or --max_mb, or --rays in a new run"
+    except (torch.OutOfMemoryError, MemoryError):
+        message = "the memory is full: lower --samples, --max_mb or --rays, or larger --downscale"
     except OSError as error:  # a full disk, a folder without permission
         message = f"{error}: free or choose a place, then go on with --resume"
     except KeyboardInterrupt:

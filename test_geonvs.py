@@ -603,9 +603,11 @@ def test_a_scene_is_made_once_and_anew_when_its_sources_change(desk, source, cap
         assert np.array_equal(scene["wh"], source["wh"] // downscale) and same(scene, data_prep.read_scene(path))
         age(path, 2000)
         return capsys.readouterr().out.startswith(f"making {path}\n")
+    one = [age(file, 0) or file for file in (desk / home, *photos.iterdir())][-1]
     assert makes()
     for file, when, want in ((photos, 0, True), (poses, 0, True), (table, 0, False), (poses, 3000, True), (poses, 0, False),
-                             (table, 3000, True), (table, 2000, False), (photos, 3000, True), (photos, 0, False)):
+                             (table, 3000, True), (table, 2000, False), (photos, 3000, True), (photos, 0, False),
+                             (one, 3000, True), (one, 0, False), (desk / home, 3000, True), (desk / home, 0, False)):
         age(file, when)
         assert makes() == want
     assert makes(4) and not makes(4) and makes()
@@ -615,7 +617,7 @@ def test_a_split_named_once_stays_when_the_scene_is_made_again(desk, folder, cap
     names, table = sorted(os.listdir(folder / "dense/images")), desk / "mine.tsv"   # not the folder's own
     table.write_text("filename\tsplit\n" + "".join(f"{n}\t{'test' if n == names[2] else 'train'}\n" for n in names))
     assert run_main(folder, "--split", "mine.tsv", "--downscale", 1)[0] == 0
-    [age(folder / part, 1000) for part in ("dense/images", "dense/sparse/images.bin")], age(folder / "toy.tsv", 9e9)
+    [age(file, 1000) for file in folder.glob("**/*")]
     for downscale, when in ((1, 1000), (2, 1000), (2, 3000)):
         age(table, when)
         scene = data_prep.open_scene(folder, downscale)
@@ -780,7 +782,7 @@ def test_sfm_calls_pycolmap_in_order_once(desk, monkeypatch, source):
     base, models = photos / "database.db", photos / "models"
     assert run_main(photos, "--sfm")[0] == 0 and data_prep.scene_path(photos).exists() and models.is_dir()
     assert calls == [(base, photos), (base,), (base, photos, models), (photos / "dense", models / "1", photos)]
-    assert "was posed" in run_main(photos, "--sfm")[2]   # its photos would be posed twice
+    assert "has dense/" in run_main(photos, "--sfm")[2]   # its photos would be posed twice
     (photos / "dense").rename(desk / "old")
     fake.incremental_mapping = lambda *_: {}
     assert "overlap" in run_main(photos, "--sfm")[2]
@@ -1222,14 +1224,6 @@ def test_differences_of_quadratics_are_exact_but_for_the_mixed_terms_of_a_tetrah
     close((y - x[:, None]).norm(dim=2), eps * torch.tensor([0, 1, 1, 1, 1]).expand(20, 5))
 
 
-def test_direction_basis_spans_the_spherical_harmonics_up_to_degree_two():
-    d = F.normalize(random(500, 3, low=-1), dim=1)
-    (x, y, z), basis = d.T, g.direction_basis(d)
-    harmonics = torch.stack([0 * x + 1, x, y, z, x * y, y * z, x * z, x * x - y * y, 3 * z * z - 1], 1)
-    assert basis.shape == (500, 9) and torch.linalg.matrix_rank(basis) == 9
-    close(basis @ torch.linalg.lstsq(basis, harmonics).solution, harmonics, atol=1e-9)
-
-
 @pytest.mark.parametrize("tight", [0, 0.3, 3])
 def test_lipschitz_mlp_is_an_mlp_whose_long_rows_are_cut_to_the_bound_that_it_keeps(tight):
     mlp, x = g.LipschitzMLP([6, 20, 20, 3]), random(4000, 6, low=-3, high=3, dtype=torch.float32)
@@ -1426,7 +1420,8 @@ def test_contract_is_identity_inside_below_two_outside_monotone_and_finite_with_
 
 
 def test_background_equals_naive_loops_over_its_sections_before_and_beyond_the_sphere():
-    bg, n, want = g.Background(fill(g.Octree(2.0, 1, 2, root=4)), 16, 12), 4, []
+    bg, n, want = g.Background(random(9, 3, low=1, high=3, dtype=torch.float32), 16, 12), 4, []
+    fill(bg.octree)
     rays = sphere_rays([(0.3, 0.2, -3), (0, 2, 0)], [(0, 0.1, 1), (1, 0, 0.3)])
     t0, t1, jitter = torch.tensor([2.0, 0.1]), torch.tensor([3.0, 0.5]), random(2, n + 2, seed=4, dtype=torch.float32)
     per_ray, jitter[1, -1] = random(2, 12, seed=5, dtype=torch.float32), 1.0  # its last is at infinity
@@ -1467,7 +1462,8 @@ def test_colour_and_background_networks_see_what_they_should_and_their_colours_a
     front, passes = random(80, 3, seed=2, dtype=torch.float32), random(80, seed=3, dtype=torch.float32)
     model.background = lambda *args: (asked.extend(args[1:]), (front, passes, torch.ones(80, 3)))[1]
     code, jitter = random(80, 5, dtype=torch.float32), torch.rand(80, 52)
-    out, per_ray = rendered(model, rays, code, jitter), torch.cat([g.direction_basis(rays.d), code], 1)
+    out, d = rendered(model, rays, code, jitter), rays.d
+    per_ray = torch.cat([d, d * d, d * d[:, [2, 0, 1]], code], 1)
     x = seen[0][:, :3]
     close(seen[0], torch.cat([x, F.normalize(x - CENTRE, dim=1), per_ray.repeat_interleave(48, 0)], 1), atol=1e-5)
     want = *g.sphere_interval(rays), per_ray, jitter[:, 48:]  # the background leaves out the sphere
@@ -2052,12 +2048,14 @@ def test_resuming_adds_time_dropped_steps_and_energy_and_half_a_measurement_is_n
     assert 1000 < last["seconds"] < 1100 and last["dropped"] == 4 and last["step"] == 6
 
 
-@pytest.mark.parametrize("changes", [dict(), dict(lr_net=0.0), dict(lam_eik=1e6), dict(mask="off")])
-def test_resuming_takes_what_flags_say(scene, tmp_path, quick, six, changes):
-    saved = checkpoint(six.run, "after_5.pt")
+@pytest.mark.parametrize("changes", [dict(), dict(lr_net=0.0), dict(lam_eik=1e6), dict(mask="off"), dict(steps=60)])
+def test_resuming_takes_what_flags_say(scene, tmp_path, quick, six, monkeypatch, changes):
+    saved, plans, plan = checkpoint(six.run, "after_5.pt"), [], g.GeoNVS.plan
+    monkeypatch.setattr(g.GeoNVS, "plan", lambda self, is_last: plans.append(is_last) or plan(self, is_last))
     model, _ = run_training(scene, tmp_path, saved, **changes)
     assert same_weights(model, six.model) is (not changes) and (model.cfg.mask == "off") is ("mask" in changes)
     assert torch.equal(model.color.c, saved["model"]["color.c"]) is ("lr_net" in changes)
+    assert plans == ([False] * 5 + [True] if "steps" in changes else [])  # a larger budget refines again
 
 
 def test_bad_checkpoints_are_refused_in_one_sentence_and_do_no_harm(six, scene, tmp_path, monkeypatch):
@@ -2087,12 +2085,13 @@ def test_bad_checkpoints_are_refused_in_one_sentence_and_do_no_harm(six, scene, 
     assert all(map(refused, bad)) and not (tmp_path / "harm").exists() and not refused(data)
 
 
-@pytest.mark.parametrize("changes", [dict(hidden=8), dict(levels=4), dict(background="off"), {}])
+@pytest.mark.parametrize("changes", [dict(hidden=8), dict(levels=4), dict(background="off"), dict(gpl="literal"), {}, None])
 def test_a_checkpoint_that_does_not_fit_is_refused_and_its_run_stays(scene, tmp_path, quick, six, changes):
     run = shutil.copytree(six.run, tmp_path / "run")
     before, saved = {p.name: p.read_bytes() for p in run.iterdir()}, checkpoint(run)
+    other = scene._replace(raw=scene.raw | dict(is_test=~scene.raw["is_test"]))  # another split
     with pytest.raises(UserError, match="does not fit"):
-        run_training(scene, run, saved if changes else saved | dict(rng=None), **changes)
+        run_training(other if changes is None else scene, run, saved | (dict(rng=None) if changes == {} else {}), **changes or {})
     assert {p.name: p.read_bytes() for p in run.iterdir()} == before
 
 
@@ -2374,7 +2373,7 @@ def test_settings_come_from_defaults_then_the_scene_then_flags_and_devices_are_t
     for home, name, value in ((g, "RANKS", 3), (g, "LOCAL_RANK", 1), (torch.cuda, "is_available", lambda: True),
                               (torch.cuda, "device_count", lambda: 2)):
         monkeypatch.setattr(home, name, value)
-    assert [g.pick_device(name).index for name in ("auto", "cpu", "cuda", "cuda:0")] == [1, None, 1, 0]
+    assert [g.pick_device(name).index for name in ("auto", "cpu", "cuda", "cuda:0")] == [1, None, 1, 1]
     assert g.make_config(dict(data="x")) == g.Config(data="x", **g.LARGE) and g.make_config({}) == g.Config()
     assert g.make_config(dict(scene="taj", steps=9)) == g.Config(scene="taj", **g.LARGE | dict(steps=9))
     assert g.make_config(dict(data="x", device="cpu", rays=8)) == g.Config(data="x", device="cpu", rays=8)
@@ -2710,7 +2709,7 @@ def run_row(run, given, toy=None, kind=g.GeoNVS, deeper=0, **row):
         run.mkdir(parents=True, exist_ok=True)
         with open(run / "log.txt", "w") as log, contextlib.redirect_stdout(log):
             try:
-                metrics = g.execute(cfg, arrays, run, kind=kind) | key
+                metrics = g.execute(cfg, g.load_scene(arrays, g.pick_device(cfg.device)), run, kind=kind) | key
             except UserError as error:  # it diverged
                 metrics = dict(failed=str(error)) | key
         data_prep.atomic_write(done, lambda tmp: Path(tmp).write_text(json.dumps(metrics)))
