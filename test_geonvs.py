@@ -618,7 +618,7 @@ def test_a_split_named_once_stays_when_the_scene_is_made_again(desk, folder, cap
     table.write_text("filename\tsplit\n" + "".join(f"{n}\t{'test' if n == names[2] else 'train'}\n" for n in names))
     assert run_main(folder, "--split", "mine.tsv", "--downscale", 1)[0] == 0
     [age(file, 1000) for file in folder.glob("**/*")]
-    for downscale, when in ((1, 1000), (2, 1000), (2, 3000)):
+    for downscale, when in ((1, 1000), (2, 1000), (2, 3000), (2, 1000)):
         age(table, when)
         scene = data_prep.open_scene(folder, downscale)
         assert scene["name"][scene["is_test"]].tolist() == [names[2]]
@@ -1448,10 +1448,10 @@ def test_background_equals_naive_loops_over_its_sections_before_and_beyond_the_s
 @pytest.mark.parametrize("alpha", ["neus", "printed"])
 def test_past_the_sphere_is_background_alone_and_as_printed_so_is_a_part_of_what_lies_behind_a_wall(alpha):
     model = ball_model(zeta=20.0, slope=2.0, alpha=alpha, sampling="uniform", samples=400)
-    o = torch.tensor([[0, 5, -3], [0, 0, 3], [0.1, -0.25, -3]])  # past, away, through the middle of the ball
-    out = rendered(model, sphere_rays(o, [(0, 0, 1)] * 3))
+    o = torch.tensor([[0, 5, -3], [0, 0, 3], [0.1, -0.25, -3], [*CENTRE]])  # past, away, through the ball, out of it
+    out = rendered(model, sphere_rays(o, [(0, 0, 1)] * 4))
     close(out["rgb"][:2], model.bg_color.expand(2, 3))
-    assert out["opacity"][:2].tolist() == [0, 0] and not out["eikonal"][:2].any() and out["eikonal"][2].all()
+    assert out["opacity"][[0, 1, 3]].tolist() == [0, 0, 0] and not out["eikonal"][:2].any() and out["eikonal"][2].all()
     close(out["depth"][:2], [3, 0.1], atol=1e-3)
     assert (out["opacity"][2] > 0.99) == (alpha == "neus")
 
@@ -2345,7 +2345,7 @@ def test_one_command_trains_scores_and_writes_everything_and_others_go_on_and_fi
     ("--steps=many", "many"), ("--steps=0", "steps"), ("--lam_gpl=-1", "lam_gpl"), ("--lr_grid=nan", "lr_grid"),
     ("--lr_grid=inf", "lr_grid"), ("--samples=1", "samples"), ("--bg_samples=1", "bg"), ("--rays=1 --photos=1", "rays"),
     ("--rays=10 --photos=3", "photos"), ("--photos=0", "photos"), ("--hidden=0", "hidden"), ("--render", "render"),
-    ("--seed=" + "9" * 30, "seed"), ("--resume", "--resume"), ("--levels=12", "levels")])
+    ("--seed=" + "9" * 30, "seed"), ("--resume", "--resume"), ("--levels=9", "levels")])
 def test_a_mistake_ends_with_code_2_and_one_line_that_helps_and_no_folder(command, flags, word):
     assert word in command(*FLAGS, *flags.split()) and not Path("runs").exists()
 
