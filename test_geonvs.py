@@ -2739,11 +2739,11 @@ def time_to(lines, level, unit):
 def draw(name, table):
     """The figure of an experiment, from its table alone: PSNR over what it cost, or what each row gains over the
     first row, the best one last; in `stress` over the trivial predictor."""
-    from matplotlib.figure import Figure
+    from matplotlib import figure as figures, ticker
     rows = sorted((r for r in table if r["psnr"]), key=lambda r: r["psnr"] if name in ("pieces", "grid") else 0)
     if name != "chart":
         gains = [r["psnr"] - (r["psnr_floor"] if name == "stress" else table[0]["psnr"]) for r in rows]
-        axis = Figure(figsize=(7.5, 1 + 0.25 * len(rows)), layout="constrained").subplots()
+        axis = figures.Figure(figsize=(7.5, 1 + 0.25 * len(rows)), layout="constrained").subplots()
         names = [r["row"] + (f" ({r['failures']} of {r['runs']} failed)" if r["failures"] else "") for r in rows]
         axis.barh(names, gains, xerr=[r["psnr_std"] or math.nan for r in rows], capsize=3,
                   color=["tab:orange" if gain < 0 else "tab:blue" for gain in gains])
@@ -2752,14 +2752,14 @@ def draw(name, table):
         return axis.figure
     costs = (("train_seconds", "training, s"), ("energy_wh", "energy, Wh"))
     axes = [(unit, text) for unit, text in costs if any(r[unit] for r in rows)]
-    figure = Figure(figsize=(6.5 * len(axes), 4), layout="constrained")
+    figure = figures.Figure(figsize=(6.5 * len(axes), 4), layout="constrained")
     for axis, (unit, text) in zip(figure.subplots(1, len(axes), squeeze=False)[0], axes):
         for kind in dict.fromkeys(r["row"].split(" x")[0] for r in rows):
             mine = [(r[unit], r["psnr"], r["psnr_std"] or math.nan) for r in rows if r["row"].startswith(kind) and r[unit]]
             axis.errorbar(*zip(*mine), marker="o", capsize=3, label=kind)
         axis.axhline(np.mean([r["psnr_floor"] for r in rows]), color="grey", label="trivial predictor")
         axis.set(xscale="log", xlabel=text, ylabel="PSNR of held-out right halves, dB")
-        axis.xaxis.set_major_formatter("{x:g}")
+        axis.xaxis.set(major_locator=ticker.LogLocator(subs=(1, 2, 5)), major_formatter="{x:g}", minor_formatter="")
         axis.legend()
     return figure
 
