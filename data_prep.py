@@ -623,8 +623,8 @@ def main(argv=None):
     given = vars(p.parse_args(argv))
     name, fetch_first, sfm_first = (given.pop(key, None) for key in ("scene", "download", "sfm"))
     make, path = make_toy if name == "toy" else prepare, scene_path(name)
+    wrong = given.keys() - inspect.signature(make).parameters
     try:
-        wrong = given.keys() - inspect.signature(make).parameters
         need(not wrong, f"--{' --'.join(wrong)}: not for {name}")
         fetch_first and download(name)
         sfm_first and run_sfm(Path(name))

@@ -2085,7 +2085,7 @@ def test_bad_checkpoints_are_refused_in_one_sentence_and_do_no_harm(six, scene, 
     assert all(map(refused, bad)) and not (tmp_path / "harm").exists() and not refused(data)
 
 
-@pytest.mark.parametrize("changes", [dict(hidden=8), dict(levels=4), dict(background="off"), dict(gpl="literal"), {}, None])
+@pytest.mark.parametrize("changes", [dict(hidden=8), dict(levels=4), dict(background="off"), dict(gpl="literal"), dict(grid="uniform"), {}, None])
 def test_a_checkpoint_that_does_not_fit_is_refused_and_its_run_stays(scene, tmp_path, quick, six, changes):
     run = shutil.copytree(six.run, tmp_path / "run")
     before, saved = {p.name: p.read_bytes() for p in run.iterdir()}, checkpoint(run)
