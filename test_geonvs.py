@@ -2243,6 +2243,7 @@ def test_a_rendered_photo_and_its_panel_show_pixels_in_order_whatever_the_chunk(
 
 
 def test_mesh_of_the_warm_up_sphere_is_that_sphere_closed_looking_outwards_and_reads_back(warm, scene, tmp_path):
+    assert torch.equal(warm.distance(x := random(99, 3, low=-1).float()), warm.sdf(x)[0])  # what rays see
     vertices, faces = mesh = g.extract_mesh(warm, 60)
     x = (vertices - scene.raw["center"]) / scene.raw["scale"]
     a, b, c = (x[faces[:, i]] for i in range(3))
