@@ -1994,8 +1994,8 @@ def test_twenty_void_steps_in_a_row_stop_a_run_with_its_last_good_weights_and_fe
 class AsksNothing(TorchDispatchMode):
     """Refuses operators that need a value of a tensor on the host: a GPU would run dry while it waits."""
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
-        asks = ("_local_scalar_dense", "nonzero", "masked_select", "unique", "equal", "is_nonzero")
-        assert not any(word in func.name() for word in asks), func.name()
+        is_free = func.name() == "aten::equal" and args[0].dtype == torch.bool  # older torch's check of quantile's q, on CPUs
+        assert is_free or not re.search("_local_scalar_dense|nonzero|masked_select|unique|equal", func.name()), func.name()
         return func(*args, **kwargs or {})
 
 
