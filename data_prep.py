@@ -12,7 +12,7 @@ import argparse, contextlib, gzip, http.client, inspect, io, itertools, json, ma
 import struct, sys, tarfile, tempfile, time, urllib.request, zipfile, zlib
 from pathlib import Path
 
-import cv2
+import cv2, skimage.io
 import numpy as np
 
 SCENES = {"brandenburg": ("brandenburg_gate", "brandenburg.tsv"),   # name: (archive, split file)
@@ -57,7 +57,7 @@ def tell(items, what):
 def atomic_write(path, write):
     """write(temporary path), then rename: `path` is the whole old file or the whole new one."""
     path = Path(path)
-    part = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
+    part = path.with_name(f".{path.stem}.{os.getpid()}.{time.time_ns()}{path.suffix}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         need(write(part) is not False, f"cannot encode {path}")   # so cv2.imwrite says no
@@ -436,7 +436,7 @@ def read_colmap(sparse):
         key, model, w, h = take("IiQQ")
         need(model in MODELS, f"{sparse} has camera model {model}: run colmap image_undistorter")
         n, p = MODELS[model].count("f"), np.array(take(f"{len(MODELS[model]) + 2}d"))
-        need(0 < w < 1e5 and 0 < h < 1e5 and (np.abs(p) < FAR).all() and min(p[:n]) > 1 / FAR,
+        need(0 < w < 32767 and 0 < h < 32767 and (np.abs(p) < FAR).all() and min(p[:n]) > 1 / FAR,
              f"{sparse}: camera {key} is {w} x {h} with {p.tolist()}, which cannot be: export it")
         cameras[key] = w, h, p[[0, n - 1, n, n + 1]], np.append(p[n + 2:], np.zeros(4))[:4]
     take = open_binary(sparse / "images.bin")
@@ -473,10 +473,10 @@ def read_split(path):
 
 def read_photo(path, camera, downscale):
     """Undistorted, then reduced. -> rgb uint8 (h,w,3), K (4,)"""
-    w, h, K, bend = camera
+    image, (w, h, K, bend) = None, camera
     need(1 <= downscale <= min(w, h) / 2, f"--downscale {downscale} leaves nothing of {path}")
-    image = None
-    with contextlib.suppress(cv2.error):   # more than a gigapixel
+    with contextlib.suppress(Exception):   # cut off, no photo, more than a gigapixel
+        skimage.io.imread(path)   # as OpenCV says nothing where a JPEG is cut off
         image = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)   # COLMAP's
     need(np.shape(image)[:2] == (h, w), f"{path} is no photo of {w} x {h}: replace or delete it")
     if bend.any():   # OpenCV's first pixel is at 0
@@ -500,7 +500,7 @@ def prepare(name, downscale=2, split=None):
          f"--{'download' if name in SCENES else 'sfm'}")
     folder, images, sparse = found[0]
     tables = [Path(split)] if split else sorted(folder.glob("[!.]*.tsv"))
-    need(len(tables) < 2, f"{folder} has {len(tables)} split files: name one by --split")
+    need(len(tables) < 2, f"{folder} has {len(tables)} split files: name one, data_prep.py --split")
     points, photos = read_colmap(sparse)
     here = sorted(n for n in photos if (images / n).is_file())
     parts = read_split(tables[0]) if tables else {

@@ -201,7 +201,7 @@ IS_SLOPE = F.pad(torch.eye(3), (1, 0)).repeat_interleave(8, 1) > 0  # (3,32)
 TRILINEAR = torch.stack([torch.where(IS_SLOPE, 2 * FAR - 1, 1 - FAR),  # (2,3,32) constant and
                          torch.where(IS_SLOPE, 0, 2 * FAR - 1)])  # factor of f
 PINNED = 64  # rows that stay zero, for hanging corners: on one row a GPU would queue their writes
-CHUNK = 4096  # points or rays evaluated at once without gradient; on a GPU 4 times as many rays
+CHUNK = 4096  # points or rays evaluated at once without gradient
 resident = functools.cache(Tensor.to)  # a constant on a device: one copy, as copies make a GPU wait
 
 
@@ -984,7 +984,8 @@ def training_step(model, optimizer, photos: Tensor, state: dict, progress: float
 def facts(model) -> list:
     """What a checkpoint must share with the scene and settings that it is read for."""
     raw, cfg = model.scene.raw, model.cfg
-    return [str(raw["info"]), *(raw[k].tolist() for k in ("name", "is_test", "scale", "center")),
+    made = {k: v for k, v in model.scene.info.items() if k not in ("folder", "split")}  # may move
+    return [made, *(raw[k].tolist() for k in ("name", "is_test", "scale", "center")),
             cfg.grid, cfg.gpl]
 
 
@@ -1099,6 +1100,7 @@ def report(model, path: Path, progress: float, state: dict, terms: dict) -> None
     left = state["seconds"] * max(0, 1 / max(progress, 1e-3) - 1) / 60
     shown = "".join(f"  {k} {line[k]:.3g}" for k in ("psnr", "zeta", "mask") if k in line)
     print(f"  step {state['step']:6d}{shown}  {rate:.0f} rays/s  {left:.1f} min left", flush=True)
+    line = {k: v if v is None or abs(v) < math.inf else None for k, v in line.items()}  # as in JSON
     with open(path, "a") as file:
         file.write(json.dumps(line) + "\n")
 
@@ -1162,9 +1164,8 @@ def fit_codes(model, scene: Scene, photos: Tensor, steps: int = 128, n: int = 0)
 def render_photo(model, scene: Scene, photo: int, code: Tensor) -> dict[str, np.ndarray]:
     """A photo's view under an appearance code (A,): arrays (H,W,...) by name of render_rays, and
     `truth` (H,W,3)."""
-    w, h = scene.wh[photo].tolist()
-    parts, n = [], 4 * CHUNK if scene.c2w.is_cuda else CHUNK  # a ray of NeRF-W takes 0.6 MiB
-    for pixel in torch.arange(w * h, device=scene.c2w.device).split(n):
+    (w, h), parts = scene.wh[photo].tolist(), []
+    for pixel in torch.arange(w * h, device=scene.c2w.device).split(CHUNK):
         rays = make_rays(scene, torch.full_like(pixel, photo), pixel)
         out = model.render(rays, code.expand(len(pixel), -1)) | dict(truth=rays.rgb)
         parts.append({k: v for k, v in out.items() if v[0].numel() in (1, 3)})  # not the samples'
@@ -1225,9 +1226,9 @@ def toy_truth(model, scene: Scene) -> dict:
 
 @torch.no_grad()
 def extract_mesh(model: GeoNVS, resolution: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """The surface s = 0 inside the unit sphere: vertices (N,3) in SfM units and faces (M,3), by
-    marching cubes over `resolution` cells (default: two per finest octree cell, at most 512). Only
-    corners near the surface are evaluated; elsewhere the cache has the sign."""
+    """The surface s = 0 in the unit sphere, open where it meets that: vertices (N,3) in SfM units,
+    faces (M,3). By marching cubes over `resolution` cells (default: two per finest octree cell, at
+    most 512); corners near the surface are evaluated, elsewhere the cache has the sign."""
     scene, cache = model.scene, model.cache.volume
     n = resolution or min(round(2 / model.eps), 512)
     line = torch.linspace(-1, 1, n + 1, device=cache.device)
@@ -1240,7 +1241,9 @@ def extract_mesh(model: GeoNVS, resolution: int = 0) -> tuple[np.ndarray, np.nda
     if not (volume < 0).any():
         return np.zeros((0, 3)), np.zeros((0, 3), int)
     vertices, faces, _, _ = marching_cubes(volume.cpu().numpy(), 0, gradient_direction="descent")
-    return (vertices * (2 / n) - 1) * scene.raw["scale"] + scene.raw["center"], faces
+    keep = np.linalg.norm(vertices * (2 / n) - 1, axis=1) < 1 - 4 / n  # not what the sphere closes
+    faces = (keep.cumsum() - 1)[faces[keep[faces].all(1)]]
+    return (vertices[keep] * (2 / n) - 1) * scene.raw["scale"] + scene.raw["center"], faces
 
 
 def write_ply(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
