@@ -540,9 +540,9 @@ class Background(nn.Module):
             for a, b in ((inputs, 1 + GEO), (GEO + per_ray, 3)))
 
     def forward(self, rays: Rays, t0: Tensor, t1: Tensor, per_ray: Tensor, jitter: Tensor):
-        """Colour (R,3) from near to t0 (R,), the share (R,) that passes it, and of that the colour
-        (R,3) beyond t1 (R,). per_ray: (R,9+A) direction and code; jitter: (R,S) in 0..1. [D8] A
-        third of the S sections are equal and end at t0; the others are equal steps of u in
+        """Colour (R,3) from near to t0 (R,), the share (R,) that passes it, and times that the
+        colour (R,3) beyond t1 (R,). per_ray: (R,9+A) direction and code; jitter: (R,S) in 0..1.
+        [D8] A third of the S sections are equal and end at t0; the others are equal steps of u in
         t = t1 + u / (1 - u), and the last is opaque."""
         (R, S), n = jitter.shape, jitter.shape[1] // 3
         at, dt = torch.arange(S, device=t0.device) + jitter, (t0 - rays.near)[:, None] / n  # (R,1)
@@ -715,7 +715,7 @@ class TransientMask(nn.Module):
         """The terms of Eq. 5 that hold M, over the pixels of photos (B,) that rays have seen, and
         L_GPL alone. [D14] M = 1 costs a pixel its price and saves it its error; as a sigmoid hardly
         moves at 0 or 1, their difference times M is minimised through its logistic surrogate: same
-        sign, same optimum, a slope that never vanishes. Errors are signed means over 3x3 pixels, of
+        sign, same optimum, a slope while M is wrong. Errors are signed means over 3x3 pixels, of
         the worst channel: what a blurred model lacks cancels, people do not. At pixels that show
         SfM points M saves nothing; their errors tell what is usual, and the price lies above it.
         --mask printed has none of this: as in Ha-NeRF, mean M^2 is the price."""

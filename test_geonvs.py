@@ -2791,7 +2791,7 @@ def experiment(argv):
     text = "\n".join(",".join("" if v is None else f'"{v}"' if "," in str(v) else str(v) for v in r) for r in lines)
     data_prep.atomic_write(Path(f"{name}.csv"), lambda tmp: Path(tmp).write_text(text + "\n"))
     figure, trained = draw(name, table), sum(r["train_seconds"] * r["runs"] for r in table if r["train_seconds"])
-    figure.suptitle(f"{cfg.data or cfg.scene}, seeds: {seeds}, {trained / 60:.0f} minutes of training", fontsize=9)
+    figure.suptitle(f"{cfg.data or cfg.scene}, seeds: {seeds}, {trained / 60:.0f} minutes of training in all", fontsize=9)
     data_prep.atomic_write(Path(f"{name}.png"), lambda tmp: figure.savefig(tmp, dpi=110))
     print(f"wrote {name}.csv and {name}.png after {time.perf_counter() - begin:.0f} s")
 
