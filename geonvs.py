@@ -79,7 +79,7 @@ class Config:
     photos: int = opt(8, "photos per step, of each process; a lesson of the mask shows them whole")
     samples: int = opt(16, "foreground samples per ray")
     bg_samples: int = opt(24, "background samples per ray, a third of them before the sphere")
-    levels: int = opt(0, "octree levels, 0: from the pixel footprint at the surface")
+    levels: int = opt(0, "octree levels, 0: from the pixel footprint at the surface", *range(9))
     grid: str = opt("octree", "uniform: the same finest cell everywhere", "octree", "uniform")
     max_mb: float = opt(1000.0, "up to which the foreground's octree and its moments grow, MiB")
     hidden: int = opt(64, "width of the MLPs")
@@ -109,7 +109,6 @@ class Config:
             is_right = isinstance(value, str) if f.type is str else low <= value < 2 ** 63
             need(is_right and value in (f.metadata["choices"] or [value]),
                  f"--{f.name} {value} makes no sense: use a number from {low}, or see --help")
-        need(self.levels <= 8, "--levels goes up to 8: 2048 cells a side")
         need(self.rays % self.photos == 0, "--rays must be a multiple of --photos")
 
     @property
@@ -210,18 +209,17 @@ class Interpolate(torch.autograd.Function):
     of the value, and of its derivatives along x, y, z. The hottest operation of a step."""
     @staticmethod
     def forward(ctx, features, corner, w):  # (V,C), (P,8), (P,J,8) -> (P,J,C)
-        ctx.save_for_backward(corner, w)
-        ctx.rows = len(features)
+        ctx.save_for_backward(features, corner, w)
         at = corner[:, None].expand(w.shape).reshape(-1, 8)  # (PJ,8)
         out = F.embedding_bag(at, features, per_sample_weights=w.reshape(-1, 8), mode="sum")
         return out.reshape(*w.shape[:2], features.shape[1])
 
     @staticmethod
     def backward(ctx, grad):  # (P,J,C)
-        corner, w = ctx.saved_tensors
+        features, corner, w = ctx.saved_tensors
         by_corner = w.transpose(1, 2)  # (P,8,J)
         spread = by_corner * grad if w.shape[1] == 1 else torch.bmm(by_corner, grad)  # (P,8,C)
-        out = grad.new_zeros(ctx.rows, grad.shape[2])  # (V,C)
+        out = torch.zeros_like(features)  # (V,C)
         out.index_add_(0, corner.flatten().long(), spread.flatten(0, 1))  # a CPU adds slowly by int
         out[:PINNED] = 0  # hanging corners learn nothing
         return out, None, None
@@ -683,11 +681,10 @@ class TransientMask(nn.Module):
         self.calibration = nn.Buffer(torch.tensor([0.0, 1.0]))  # centre and width of Phi
         # running upper quartiles of errors at SfM points: beside the foreground, and of it
         self.usual = nn.Buffer(torch.full((2,), 0.3))
-        static = torch.zeros(I, 1, m, m, dtype=torch.bool, device=scene.thumbs.device)
+        self.static = nn.Buffer(scene.is_test.new_zeros(I, 1, m, m))  # which pixels show SfM points
         ok = ((scene.track_uv >= 0) & (scene.track_uv < 1)).all(1)  # not those that SfM got wrong
         col, row = (scene.track_uv[ok] * m).long().unbind(1)  # (T,)
-        static[scene.track_photo[ok], 0, row, col] = True  # scene, but for some on outlines [D10]
-        self.static = nn.Buffer(static)
+        self.static[scene.track_photo[ok], 0, row, col] = True  # but for some on outlines [D10]
 
     def look(self, pick: Tensor) -> Tensor:
         """Logits (B,1,m,m) of photos (B,)."""
@@ -743,10 +740,6 @@ class TransientMask(nn.Module):
 
 # ---- 7 The model and its objective ---------------------------------------------------------------
 
-def octrees_of(model: nn.Module) -> list[Octree]:
-    return [part for part in model.modules() if isinstance(part, Octree)]
-
-
 SHARP = 40.0  # zeta from which on SfM points pull with their full weight; at fog they pull less
 
 
@@ -777,6 +770,7 @@ class GeoNVS(nn.Module):
         self.color = LipschitzMLP([GEO + self.sdf.features + 3 + 9 + A, cfg.hidden, cfg.hidden, 3])
         outer = scene.points[~inside]  # (K,3)
         self.background = Background(outer, cfg.hidden, 9 + A) if has_field else None
+        self.octrees = [part.octree for part in (self.sdf, self.background) if part]
         self.deviation, self.mask = Deviation(), TransientMask(cfg, scene)
         self.cache = SDFCache(int(np.clip(octree.root << levels - 1, 64, 128)))
         self.bg_color = nn.Buffer(torch.as_tensor(raw["bg_color"]).float().nan_to_num(0.5))
@@ -846,7 +840,7 @@ class GeoNVS(nn.Module):
     def groups(self) -> list[dict]:
         """Optimiser groups: what is looked up fast, networks slower, mask and zeta apart: eps
         lets no vanishing gradient drive zeta away."""
-        tables = [self.appearance.weight, *(o.features for o in octrees_of(self))]
+        tables = [self.appearance.weight, *(o.features for o in self.octrees)]
         mask = list(self.mask.parameters())
         taken = {id(p) for p in [*tables, *mask, self.deviation.v]}
         nets = [p for p in self.parameters() if id(p) not in taken]
@@ -993,7 +987,7 @@ def save_checkpoint(path: Path, model, optimizer, gen, state: dict) -> None:
     buffer = io.BytesIO()  # as torch.save calls a full disk a RuntimeError
     torch.save(dict(config=asdict(model.cfg), model=model.state_dict(), rng=gen.get_state(),
                     optimizer=optimizer.state_dict(), state=state, facts=facts(model),
-                    octrees=[o.split_keys for o in octrees_of(model)]), buffer)
+                    octrees=[o.split_keys for o in model.octrees]), buffer)
     atomic_write(path, lambda tmp: tmp.write_bytes(buffer.getbuffer()))
 
 
@@ -1017,7 +1011,7 @@ def restore(saved: dict, path: Path, model, gen=None) -> torch.optim.Adam:
     """Puts a checkpoint's weights into a model, its state into gen; returns its optimiser."""
     try:
         need(saved["facts"] == facts(model), "another scene or split")
-        for octree, keys in zip(octrees_of(model), saved["octrees"], strict=True):
+        for octree, keys in zip(model.octrees, saved["octrees"], strict=True):
             octree.build(keys.to(octree.features.device))
         model.load_state_dict(saved["model"])
         optimizer = torch.optim.Adam(model.groups(), **model.adam, fused=True)
@@ -1055,15 +1049,14 @@ def train(cfg: Config, scene: Scene, run: Path, saved: dict | None = None, kind=
         gen.manual_seed(cfg.seed + RANK + RANKS * state["step"])  # own rays for each process
     photos, begin, spent = scene.photos(False), begin - state["seconds"], state["joules"]
     next_line, next_save = state["seconds"] + 5, state["seconds"] + 60
-    dropped = torch.tensor(state["dropped"], device=photos.device)
-    streak = torch.zeros_like(dropped)  # void steps in a row
+    streak = 0  # void steps in a row
     while True:
         seconds = agreed(time.perf_counter() - begin)
         progress = seconds / (60 * cfg.minutes) if cfg.minutes else state["step"] / cfg.steps
         has_diverged = state["step"] % PATIENCE == 0 and int(streak) >= PATIENCE
         is_over = progress >= 1 or has_diverged
         if is_over or seconds > next_line:
-            state["dropped"] = int(dropped)  # waits for a GPU's queue
+            state["dropped"] = int(state["dropped"])  # waits for a GPU's queue
             meter.tick()
             joules = None if None in (spent, meter.joules) else spent + meter.joules
             state |= dict(joules=joules, energy_wh=joules and joules / 3600, source=meter.source,
@@ -1076,7 +1069,7 @@ def train(cfg: Config, scene: Scene, run: Path, saved: dict | None = None, kind=
         if is_over:
             break
         terms, is_void = training_step(model, optimizer, photos, state, progress, gen)
-        dropped, streak = dropped + is_void, (streak + 1) * is_void
+        state["dropped"], streak = state["dropped"] + is_void, (streak + 1) * is_void
         due = sum(progress >= share for share in REFINE_AT)
         if state["refined"] != due:  # or fewer: resumed with a larger budget
             state["refined"] = due
@@ -1165,7 +1158,8 @@ def render_photo(model, scene: Scene, photo: int, code: Tensor) -> dict[str, np.
     """A photo's view under an appearance code (A,): arrays (H,W,...) by name of render_rays, and
     `truth` (H,W,3)."""
     (w, h), parts = scene.wh[photo].tolist(), []
-    for pixel in torch.arange(w * h, device=scene.c2w.device).split(CHUNK):
+    size = CHUNK if scene.c2w.is_cuda else CHUNK // 8  # launches bind a GPU, its cache a CPU
+    for pixel in torch.arange(w * h, device=scene.c2w.device).split(size):
         rays = make_rays(scene, torch.full_like(pixel, photo), pixel)
         out = model.render(rays, code.expand(len(pixel), -1)) | dict(truth=rays.rgb)
         parts.append({k: v for k, v in out.items() if v[0].numel() in (1, 3)})  # not the samples'
@@ -1280,19 +1274,20 @@ def panel(model, frames: list[tuple[int, str, dict]], width: int = 240) -> np.nd
 
 def finish(model, scene: Scene, state: dict, run: Path) -> dict:
     """Scores a trained model and writes metrics.json, panel.png and mesh.ply below run."""
-    cfg, is_gpu, octrees = model.cfg, scene.c2w.is_cuda, octrees_of(model)
+    cfg, is_gpu, octrees = model.cfg, scene.c2w.is_cuda, model.octrees
     peak = (torch.cuda.max_memory_allocated(scene.c2w.device) if is_gpu else  # before scoring
             resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
             * (1 if sys.platform == "darwin" else 1024))
     scores = evaluate(model, scene, make_lpips(scene.c2w.device))
-    busy = scene.photos(False)
-    if hasattr(model, "sdf"):  # training photos with most on the mask
-        share = model.mask.logits[busy].sigmoid().mean((1, 2, 3))
-        busy = busy[share.argsort(descending=True)]
+    frames = scores.pop("frames")
+    if hasattr(model, "sdf"):
         write_ply(run / "mesh.ply", *extract_mesh(model))
-    frames = [(i, f"training: {scene.raw['name'][i]}",
-               render_photo(model, scene, i, model.codes()[i])) for i in busy[:2].tolist()]
-    picture = panel(model, frames + scores.pop("frames"))[:, :, ::-1]
+        busy = scene.photos(False)
+        share = model.mask.logits[busy].sigmoid().mean((1, 2, 3))
+        busy = busy[share.argsort(descending=True)][:2].tolist()  # with most on the mask
+        frames = [(i, f"training: {scene.raw['name'][i]}",
+                   render_photo(model, scene, i, model.codes()[i])) for i in busy] + frames
+    picture = panel(model, frames)[:, :, ::-1]
     atomic_write(run / "panel.png", lambda tmp: cv2.imwrite(str(tmp), picture))
     parameters = sum(p.numel() for p in model.parameters())
     git = ["git", "-C", Path(__file__).parent, "rev-parse", "--short", "HEAD"]
@@ -1365,9 +1360,8 @@ def make_parser() -> argparse.ArgumentParser:
 
 def pick_device(name: str) -> torch.device:
     """The device of this process: with torchrun each has its own GPU."""
-    count = torch.cuda.device_count() if torch.cuda.is_available() else 0
-    names = ["cpu", *(f"cuda:{i}" for i in range(count))]
-    chosen = ("cuda" if count else "cpu") if name == "auto" else name
+    names = ["cpu", *(f"cuda:{i}" for i in range(torch.cuda.device_count()))]
+    chosen = ("cuda" if names[1:] else "cpu") if name == "auto" else name
     if chosen == "cuda" or RANKS > 1 and chosen in names[1:]:
         chosen = f"cuda:{LOCAL_RANK}"
     need(chosen in names, f"--device {name} is not there: this machine has {', '.join(names)}")
@@ -1377,7 +1371,7 @@ def pick_device(name: str) -> torch.device:
 def make_config(given: dict) -> Config:
     """Config's defaults, then LARGE if photos meet a GPU, then flags."""
     is_toy = not given.get("data") and given.get("scene", "toy") == "toy"
-    has_gpu = given.get("device") != "cpu" and torch.cuda.is_available()
+    has_gpu = given.get("device") != "cpu" and torch.cuda.device_count() > 0
     return Config(**(LARGE if has_gpu and not is_toy else {}) | given)
 
 
