@@ -16,8 +16,9 @@ Conventions
   rays      r(t) = o + t d with |d| = 1, so t is a distance along the ray and not a z-depth
   sdf       positive outside; the normal is the unit gradient; colours are sRGB in [0, 1]
   mask      M = 1 means transient (person, car), M = 0 means scene
-  shapes    R rays, S samples per ray, P points, L octree levels, C channels per level, V octree
-            corners, A appearance dims, B photos of a step of all I, K sparse points, T sightings
+  shapes    R rays, S samples per ray, P points, N cells or pixels, L octree levels, C channels per
+            level, V rows of features, H hidden width, G what colour is read from, A appearance
+            dims, B photos of all I, K SfM points, T sightings of them, m side of a mask
 
 Where the printed paper is departed from, the line carries its tag:
   [D1]  alpha is divided by sigmoid(zeta s_prev) and never negative (printed: a wall is 63 % opaque)
@@ -25,8 +26,8 @@ Where the printed paper is departed from, the line carries its tag:
   [D3]  Phi: NeuS-weighted E_grad, |lap| eps opacity, set by quantiles, detached, times opacity
   [D4]  the curvature loss is |lap| eps opacity: |lap| of a trilinear field grows as eps shrinks
   [D5]  the Lipschitz term is a sum of logs, not a product that can drown the colour at first
-  [D6]  CGNet: GroupNorm, ReLU, half width, a block a stage, no residual, low bias, finer head
-  [D7]  the mask pays M, not M^2, as the error is L1; its price lies above what SfM pixels err by
+  [D6]  CGNet: GroupNorm, ReLU, half width, one block a stage, no residual, low bias, finer head
+  [D7]  the mask pays M, not M^2, as the error is L1: lam_mask more than most SfM pixels err by
   [D8]  the background also fills what lies before the sphere; its last section is opaque
   [D9]  all is float32: mixed precision, as the paper has it, makes noise of distances and normals
   [D10] SfM points place the sphere, seed the octree, teach M = 0 and pull s(p) to zero, but less
@@ -35,6 +36,9 @@ Where the printed paper is departed from, the line carries its tag:
   [D12] test photos: appearance fitted on the left half, scored on the right half
   [D13] exact normals by trilinear weights (--normals fd: as printed); curvature where a ray ends
   [D14] the mask learns every few steps, by a logistic surrogate, from averaged errors of photos
+  [D15] zeta has a rising floor, which only a surface that stays fog among people ever meets
+  [D16] cells split where colours err and merge far from surfaces; a scene that needs no codes, no
+        mask or no background field is modelled without
 """
 import argparse, datetime, functools, gc, io, json, math, os
 import resource, shutil, subprocess, sys, time
@@ -66,7 +70,7 @@ def opt(default, text, *choices):
 
 @dataclass
 class Config:
-    """All settings. [R]: a value that the paper leaves open, as predecessors recommend it."""
+    """All settings. The paper gives lam_gpl and leaves the others open."""
     scene: str = opt("toy", "synthetic, or of Phototourism", "toy", *data_prep.SCENES)
     data: str = opt("", "an IMC-PT or COLMAP folder instead of a named scene")
     name: str = opt("", "run folder below runs/ (default: scene-method-seed)")
@@ -76,26 +80,26 @@ class Config:
     minutes: float = opt(0.0, "training budget in minutes, instead of --steps if above 0")
     downscale: int = opt(2, "integer factor by which photos are made smaller (benchmarks use 2)")
     rays: int = opt(512, "rays per step, of all processes together")
-    photos: int = opt(8, "photos per step, of each process; a lesson of the mask shows them whole")
+    photos: int = opt(8, "photos per step, of each process; the mask network sees them whole")
     samples: int = opt(16, "foreground samples per ray")
     bg_samples: int = opt(24, "background samples per ray, a third of them before the sphere")
     levels: int = opt(0, "octree levels, 0: from the pixel footprint at the surface", *range(9))
     grid: str = opt("octree", "uniform: the same finest cell everywhere", "octree", "uniform")
-    max_mb: float = opt(1000.0, "up to which the foreground's octree and its moments grow, MiB")
+    max_mb: float = opt(1000.0, "limit of the foreground's octree with Adam's moments, MiB")
     hidden: int = opt(64, "width of the MLPs")
     appearance_dim: int = opt(16, "length of a photo's appearance code")
     appearance: str = opt("auto", "codes; auto: on if exposures differ", "auto", "on", "off")
-    mask: str = opt("auto", "printed: paid by M^2, as in Ha-NeRF", "auto", "on", "off", "printed")
+    mask: str = opt("auto", "auto: if M over 0.01; printed: M^2", "auto", "on", "off", "printed")
     background: str = opt("auto", "field; auto: off if it is one colour", "auto", "on", "off")
     normals: str = opt("analytic", "derivatives of the SDF [D13]", "analytic", "fd")
     sampling: str = opt("cached", "how samples are placed [D11]", "cached", "uniform")
     alpha: str = opt("neus", "opacity of a section [D1] [D2]", "neus", "printed")
-    gpl: str = opt("calibrated", "centre and width of Phi [D3]", "calibrated", "literal")
+    gpl: str = opt("calibrated", "sigmoid of Phi [D3]; literal: 0 and 1", "calibrated", "literal")
     lam_eik: float = opt(0.04, "weight of the eikonal loss (Permuto-SDF)")
     lam_curv: float = opt(3e-3, "weight of the curvature loss, on |lap| eps [D4]")
     lam_gpl: float = opt(0.05, "weight of the geometry-preservation loss (paper)")
-    lam_lps: float = opt(1e-5, "weight of the Lipschitz loss, log form [D5] [R]")
-    lam_off: float = opt(1e-3, "weight of the off-surface loss [R]")
+    lam_lps: float = opt(1e-5, "weight of the Lipschitz loss, log form [D5]")
+    lam_off: float = opt(1e-3, "weight of the off-surface loss")
     lam_sfm: float = opt(7.5e-3, "weight of min(zeta, 40) |s(p)| at SfM points [D10]")
     lam_mask: float = opt(0.04, "weight of mean M: the excess error that masks a pixel [D7]")
     lr_grid: float = opt(1e-2, "learning rate of octree features and appearance codes")
@@ -227,19 +231,21 @@ class Interpolate(torch.autograd.Function):
 
 class Octree(nn.Module):
     """Feature grid over the cube [-half, half]^3 that is fine only where it has been split. Level 0
-    is a dense grid of root^3 cells; a node points to its first of eight children. Nodes 0-7 are the
-    null block: a leaf's children, and their own. Features live on corners, shared by the cells that
-    meet there. A corner with a missing cell around it ("hanging") is pinned to zero: the field is
-    continuous across the borders of refined regions. Levels that a place lacks are zeros there."""
+    is a dense grid of root^3 cells; a node points to its first of eight children. Nodes 0-7, the
+    null block, stand in for children that do not exist. Features live on corners, shared by the
+    cells that meet there. A corner with a missing cell around it ("hanging") is pinned to zero: the
+    field is continuous across borders of refined regions. Levels that a place lacks are zeros."""
     def __init__(self, half: float, levels: int, channels: int = 4, device="cpu", root: int = 16):
         super().__init__()
         self.half, self.levels, self.root = half, levels, root
+        self.n = (root << levels) + 1  # more than the finest level has corners a side
         self.features = nn.Parameter(torch.zeros(PINNED, channels, device=device))  # (V,C)
         self.row_key = torch.arange(-PINNED, 0, device=device)  # (V,) the corner that owns a row
         constant = lambda value: nn.Buffer(value.to(device), persistent=False)
         self.per_unit = constant(1 / self.cell(torch.arange(levels)))  # (L,)
         self.middle = constant(half * self.per_unit[:, None])  # (L,1) of the cube, in cells
         self.trilinear = constant(TRILINEAR)  # (2,3,32)
+        # a cell's number: row-major on level 0, then among 8 children by the last bits of i, j, k
         steps = torch.tensor([[-1, root ** 2, root, 1], *[[1, 4, 2, 1]] * (levels - 1)]).int()
         self.bits, self.stride = constant(steps[:, :1]), constant(steps[:, 1:])  # (L,1), (L,3)
         self.build(self.row_key[:0])
@@ -250,8 +256,7 @@ class Octree(nn.Module):
 
     def key(self, at: Tensor) -> Tensor:
         """One number for a cell or corner (...,4) level, i, j, k; linear in them."""
-        n = (self.root << self.levels) + 1
-        return ((at[..., 0] * n + at[..., 1]) * n + at[..., 2]) * n + at[..., 3]
+        return ((at[..., 0] * self.n + at[..., 1]) * self.n + at[..., 2]) * self.n + at[..., 3]
 
     def build(self, split_keys: Tensor) -> Tensor:
         """Makes nodes and corners from the keys of the cells that are split. New features are zero.
@@ -266,7 +271,7 @@ class Octree(nn.Module):
         self.cells, cut = torch.cat(cells), torch.cat(cut)  # (N,4), (N,) is it split
         self.child = F.pad(torch.where(cut, 8 * cut.cumsum(0) + self.root ** 3, 0), (8, 0)).int()
         self.active = int(self.cells[-1, 0]) + 1  # levels that have cells
-        key, n = self.key(self.cells), (self.root << self.levels) + 1  # (N,)
+        key, n = self.key(self.cells), self.n  # (N,)
         self.split_keys = key[cut]
         keys, inverse, count = torch.unique(key[:, None] + self.key(F.pad(octant, (1, 0))),  # (N,8)
                                             return_inverse=True, return_counts=True)
@@ -287,8 +292,8 @@ class Octree(nn.Module):
         self.build(torch.cat([self.split_keys, self.key(cells).flatten()]))
 
     def locate(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Nodes (P,L) that hold x (P,3) on the levels that have cells, 8 + the row in cells or of
-        the null block; and where in each, 0..1 (P,L,3). Outside the cube: the nearest inside."""
+        """Nodes (P,L) that hold x (P,3), 8 + the row in cells, below 8 where a level has no cell;
+        and where in each, 0..1 (P,L,3). An x outside the cube is moved to its border."""
         x = x.nan_to_num(0).clamp(-self.half, self.half * (1 - 1e-6))[:, None]  # (P,1,3)
         middle, per_unit = self.middle[:self.active], self.per_unit[:self.active, None]  # (L,1)
         at = torch.addcmul(middle, x, per_unit)  # (P,L,3) in cells
@@ -312,8 +317,8 @@ class Octree(nn.Module):
 
 
 def seed_octree(octree: Octree, points: Tensor, dense: int, near: int = 1) -> None:
-    """Random features; all cells of the first `dense` levels split, of the `near` next those near
-    points (P,3) and their neighbours, so that no corner around a point is hanging. [D10]"""
+    """Splits the first `dense` levels everywhere, `near` more around points (P,3), neighbours too,
+    so that no corner of a point's cell is hanging; then random features. [D10]"""
     for _ in range(dense):
         octree.split(octree.cells)
     step = torch.cartesian_prod(*[torch.arange(-1, 2, device=points.device)] * 3)  # (27,3)
@@ -323,11 +328,6 @@ def seed_octree(octree: Octree, points: Tensor, dense: int, near: int = 1) -> No
     octree.features.data[PINNED:].normal_(0, 0.01)
 
 
-def levels_for_footprint(footprint: float) -> int:
-    """Octree levels, 2 to 8: the finest cell is no smaller than a pixel at the surface."""
-    return int(np.clip(1 + math.floor(math.log2(2 / footprint / 16)), 2, 8))
-
-
 SPLIT_RAYS = 6  # recent rays that end in a cell before it is split
 SPLIT_ERROR = 2.0  # their mean error over the lower quartile of all rays' that splits it
 HIDDEN = 6.0  # zeta |s| from where on the field is hardly seen: sigmoid(-6) = 0.0025
@@ -335,11 +335,10 @@ HIDDEN = 6.0  # zeta |s| from where on the field is hardly seen: sigmoid(-6) = 0
 
 @torch.no_grad()
 def refined_keys(octree: Octree, sdf, hits: Tensor, zeta: float, max_mb: float) -> Tensor:
-    """Split keys that fit the octree to the scene. sdf: (P,3) to (P,); hits (P,5): where recent
-    rays ended, their error, a pixel's size there; 2 where none was. A cell at the surface is split
-    if enough rays end in it, they miss their colour, and the children are not finer than pixels;
-    worst first, as far as max_mb allows. It is merged if hardly anything is seen of it and within
-    its side."""
+    """Keys of the cells that should be split. sdf: (P,3) to (P,); hits (P,5): where recent rays
+    ended, their masked error, a pixel's size there; 2: no ray yet. A cell at the surface is split
+    if enough rays end in it, their error is high and its children are no finer than pixels; worst
+    first, as far as max_mb allows. It is merged if hardly anything near it is seen. [D16]"""
     is_inside = hits[:, :3].norm(dim=1) < 1  # (P,) rays that miss the sphere split no cells
     if not is_inside.any():
         return octree.split_keys
@@ -356,7 +355,7 @@ def refined_keys(octree: Octree, sdf, hits: Tensor, zeta: float, max_mb: float) 
     error, pixel, count = found[8:8 + len(cells)].unbind(1)  # (N,) sums
     pays = (count >= SPLIT_RAYS) & (error > bound * count) & (pixel < count * side / 2)  # (N,)
     pays &= (s < reach) & ~is_split
-    held = 76 + 16 * octree.features.shape[1]  # bytes of a node, and of a row with Adam's moments
+    held = 76 + 16 * octree.features.shape[1]  # bytes: a node; a row, its gradient, Adam's moments
     room = max(0, int(max_mb * 2 ** 20 / held) - len(octree.child)) // 8
     worst = (error / count)[pays].argsort(descending=True)  # (Q,)
     is_split[pays.nonzero()[worst[:room], 0]] = True
@@ -443,12 +442,17 @@ class Deviation(nn.Module):
     def forward(self, most: float = 1e5) -> Tensor:
         return torch.exp(10 * self.v).clamp(1e-2, most)
 
+    @torch.no_grad()
+    def rise(self, step: int) -> None:
+        """Lifts zeta to a floor of 15 at first, of 80 after 1,300 steps [D15]. In a crowd, fog
+        hides people from the mask, and people that it misses keep up the fog."""
+        self.v.clamp_(min=math.log(min(15 + step / 20, 80)) / 10)
+
 
 def neus_alpha(sdf: Tensor, cos: Tensor, dt: Tensor, zeta: Tensor) -> Tensor:
     """Opacity (R,S) of sections of length dt with SDF sdf and slope cos = <grad s, d> mid-way.
-    Eq. 1 mended: 1 - sigmoid(zeta s_next) / sigmoid(zeta s_prev) (NeuS Eq. 13) with the two ends
-    s -+ cos dt / 2 inside zeta [D2], divided so that opacities multiply up to 1 behind walls [D1].
-    A section that leads outwards (cos > 0) is transparent. Logs of sigmoids do not overflow."""
+    Eq. 1 mended: 1 - sigmoid(zeta s_next) / sigmoid(zeta s_prev) (NeuS Eq. 13) [D1] with the two
+    ends s -+ cos dt / 2 inside zeta [D2]. 0 where a ray leads outwards. Logs do not overflow."""
     half = F.relu(cos * (dt / -2))  # (R,S)
     before, after = F.logsigmoid(zeta * torch.stack([sdf + half, sdf - half]))  # (R,S)
     return -torch.expm1(after - before)
@@ -463,7 +467,7 @@ def printed_alpha(sdf: Tensor, cos: Tensor, dt: Tensor, zeta: Tensor) -> Tensor:
 
 def composite(alpha: Tensor) -> tuple[Tensor, Tensor]:
     """Weights w_i = T_i alpha_i (R,S), T_i = prod_{j<i} (1 - alpha_j); what passes, T (R,). Eq. 2
-    The product runs as a sum of logs: its backward needs no look for zeros."""
+    A sum of logs: its backward needs no look for zeros; opaque sections still pass 1e-6."""
     passes = torch.log1p((1e-6 - 1) * alpha)  # (R,S) log of what passes a section
     w = torch.exp(passes.cumsum(1) - passes) * alpha  # (R,S)
     return w, 1 - w.sum(1)
@@ -495,7 +499,7 @@ class SDFCache(nn.Module):
         n = self.volume.shape[-1]
         line = torch.linspace(-1, 1, n, device=self.volume.device)  # (n,)
         x = torch.cartesian_prod(line[part::parts], line, line)  # (P,3)
-        size = 2 ** 18 if x.is_cuda else 2 ** 15  # launches bind a GPU, its cache a CPU
+        size = 2 ** 18 if x.is_cuda else 2 ** 15  # few calls for a GPU, what fits a CPU's cache
         s = torch.cat([sdf(some) for some in x.split(size)])  # (P,)
         self.volume[0, 0, part::parts] = s.reshape(-1, n, n)
 
@@ -538,10 +542,10 @@ class Background(nn.Module):
             for a, b in ((inputs, 1 + GEO), (GEO + per_ray, 3)))
 
     def forward(self, rays: Rays, t0: Tensor, t1: Tensor, per_ray: Tensor, jitter: Tensor):
-        """Colour (R,3) from near to t0 (R,), the share (R,) that passes it, and times that the
-        colour (R,3) beyond t1 (R,). per_ray: (R,9+A) direction and code; jitter: (R,S) in 0..1.
-        [D8] A third of the S sections are equal and end at t0; the others are equal steps of u in
-        t = t1 + u / (1 - u), and the last is opaque."""
+        """Colour (R,3) of what lies before t0 (R,), the share (R,) of light that passes it, and
+        that share of the colour (R,3) beyond t1 (R,). per_ray: (R,9+A) direction, code; jitter
+        (R,S) in 0..1. [D8] A third of the S sections are equal and end at t0; the others are
+        equal steps of u in t = t1 + u / (1 - u), and the last is opaque."""
         (R, S), n = jitter.shape, jitter.shape[1] // 3
         at, dt = torch.arange(S, device=t0.device) + jitter, (t0 - rays.near)[:, None] / n  # (R,1)
         before = torch.addcmul(rays.near[:, None], dt, at[:, :n])  # (R,n)
@@ -562,8 +566,8 @@ class Background(nn.Module):
 
 def render_rays(model: "GeoNVS", rays: Rays, code: Tensor, jitter: Tensor) -> dict[str, Tensor]:
     """One ray batch through the whole model. code: (R,A) appearance; jitter in 0..1, for S samples
-    and those of the background. Returns rgb (R,3), eikonal error of each sample (R,S), and without
-    gradient opacity, depth (R,), normal, the ray's end x (R,3), E_grad of Eq. 4 (R,)."""
+    and the background's. Returns rgb (R,3), eikonal error of each sample (R,S), and without
+    gradient opacity, mean depth (R,), normal, the point there x (R,3), E_grad of Eq. 4 (R,)."""
     cfg, R, S, zeta = model.cfg, len(rays.o), model.cfg.samples, model.deviation()
     t0, t1 = sphere_interval(rays)  # (R,)
     seen_zeta = zeta if cfg.sampling == "cached" else 0 * zeta  # 0: nothing is seen, even sections
@@ -666,7 +670,7 @@ def gpl_loss(mask: Tensor, edge: Tensor) -> Tensor:
 
 
 MASK_EVERY = 4  # steps from one lesson of the mask network to the next [D14]
-LAM_BIMODAL = 1e-4  # weight of the pole at M = 1/2 beside mean M, above which masks freeze there
+LAM_BIMODAL = 1e-4  # weight of a term that is largest at M = 1/2; a large one no M could cross
 
 
 class TransientMask(nn.Module):
@@ -710,12 +714,11 @@ class TransientMask(nn.Module):
 
     def objective(self, pick: Tensor) -> tuple[Tensor, Tensor]:
         """The terms of Eq. 5 that hold M, over the pixels of photos (B,) that rays have seen, and
-        L_GPL alone. [D14] M = 1 costs a pixel its price and saves it its error; as a sigmoid hardly
-        moves at 0 or 1, their difference times M is minimised through its logistic surrogate: same
-        sign, same optimum, a slope while M is wrong. Errors are signed means over 3x3 pixels, of
-        the worst channel: what a blurred model lacks cancels, people do not. At pixels that show
-        SfM points M saves nothing; their errors tell what is usual, and the price lies above it.
-        --mask printed has none of this: as in Ha-NeRF, mean M^2 is the price."""
+        L_GPL alone. M = 1 costs a price and saves the error, a signed mean over 3x3 pixels of the
+        worst channel: what a blurred model lacks cancels, people do not. At pixels that show SfM
+        points M saves nothing; their errors set the price. The logistic surrogate of (price -
+        error) M has its sign and optimum, and a slope while M is wrong, where a sigmoid has none
+        [D14]. --mask printed has none of this: mean M^2 is the price, as in Ha-NeRF."""
         cfg, logits, phi = self.cfg, self.look(pick), self.phi(pick)  # (B,1,m,m)
         self.logits[pick] = logits.detach()
         residual, known = self.seen[pick, :3], (self.seen[pick, 4:] >= 0).float()  # (B,3 or 1,m,m)
@@ -733,43 +736,44 @@ class TransientMask(nn.Module):
         usual = torch.where(told, error, math.nan).flatten(1).nanquantile(0.75, 1)  # (2,)
         self.usual.lerp_(torch.where(usual.isnan(), self.usual, usual), 0.1)
         price = cfg.lam_mask + self.usual[solid.long()] + cfg.lam_gpl * phi  # (B,1,m,m) [D7]
-        price = price - error * ~static  # (B,1,m,m)
-        slope = F.softplus(torch.where(price > 0, logits, -logits))  # (B,1,m,m)
-        return (price.abs() * slope * known).mean() + pole, gpl.detach()
+        loss = price - error * ~static  # (B,1,m,m) of M = 1 instead of 0
+        slope = F.softplus(torch.where(loss > 0, logits, -logits))  # (B,1,m,m)
+        return (loss.abs() * slope * known).mean() + pole, gpl.detach()
 
 
 # ---- 7 The model and its objective ---------------------------------------------------------------
 
-SHARP = 40.0  # zeta from which on SfM points pull with their full weight; at fog they pull less
+SHARP = 40.0  # zeta from which SfM points pull with full weight
 
 
 class GeoNVS(nn.Module):
     """The paper's model: it assembles the parts above and sums their losses. What stands from
     `losses` on is what training and scoring ask of any model; rivals in the tests answer too."""
-    name, terms = "geonvsw", ("rgb", "eik", "curv", "lps", "off", "sfm")  # of Eq. 5 but for M's
+    name, terms = "geonvsw", ("rgb", "eik", "curv", "lps", "off", "sfm")  # the mask has its own
     adam = dict(betas=(0.9, 0.99), eps=1e-15)  # as is usual for feature grids (Instant-NGP)
 
     def __init__(self, cfg: Config, scene: Scene):
         super().__init__()
-        self.cfg = cfg = replace(cfg)  # a copy, as --mask auto is decided in the end
+        self.cfg = cfg = replace(cfg)  # a copy, as training decides --mask auto
         self.scene, raw, dev = scene, scene.raw, scene.c2w.device
         inside = scene.points.norm(dim=1) < 1
         self.sfm = scene.points[inside]  # (K,3)
-        levels = cfg.levels or levels_for_footprint(float(raw["footprint"]))
-        held = 20 * 16 ** 3 * 8 ** levels / 2 ** 20  # MiB of a uniform grid, 140 bytes for a cell
+        fit = 1 + math.floor(math.log2(2 / raw["footprint"] / 16))  # no cell smaller than a pixel
+        levels = cfg.levels or min(max(fit, 2), 8)
+        held = 20 * 16 ** 3 * 8 ** levels / 2 ** 20  # MiB, 140 bytes for a cell of a uniform grid
         need(cfg.grid == "octree" or held < cfg.max_mb, f"a uniform grid of {levels} levels takes "
              f"{held:.0f} MiB: lower --levels or raise --max_mb")
         octree = Octree(1.0, levels, device=dev)
         seed_octree(octree, self.sfm, 1 if cfg.grid == "octree" else levels - 1)
         has_codes = dict(on=True, off=False, auto=raw["exposure_spread"] > 0.01)[cfg.appearance]
         has_field = dict(on=True, off=False, auto=np.isnan(raw["bg_color"]).any())[cfg.background]
-        A = cfg.appearance_dim if has_codes else 0
+        A = cfg.appearance_dim if has_codes else 0  # [D16]
         self.sdf = SDFField(octree, cfg.hidden)
         self.appearance = nn.Embedding(len(scene.wh), A).requires_grad_(A > 0)  # at 0 CUDA errs
         nn.init.normal_(self.appearance.weight, std=0.01)
         self.color = LipschitzMLP([GEO + self.sdf.features + 3 + 9 + A, cfg.hidden, cfg.hidden, 3])
-        outer = scene.points[~inside]  # (K,3)
-        self.background = Background(outer, cfg.hidden, 9 + A) if has_field else None
+        self.background = (Background(scene.points[~inside], cfg.hidden, 9 + A)
+                           if has_field else None)
         self.octrees = [part.octree for part in (self.sdf, self.background) if part]
         self.deviation, self.mask = Deviation(), TransientMask(cfg, scene)
         self.cache = SDFCache(int(np.clip(octree.root << levels - 1, 64, 128)))
@@ -794,24 +798,24 @@ class GeoNVS(nn.Module):
         """The objective, Eq. 5: its weighted sum, and the raw terms by name. M is held fixed, but
         for every few steps, when the terms that teach it are added [D14]. pick: photos (B,)."""
         cfg, R, n = self.cfg, len(rays.o), len(rays.o) // 2
+        self.deviation.rise(step)
         if step % 8 == 0:  # an eighth of the cache
             self.cache.refresh(self.distance, step // 8 % 8, 8)
         jitter = torch.rand(R, cfg.samples + cfg.bg_samples, generator=gen, device=gen.device)
         out = render_rays(self, rays, self.appearance(rays.img), jitter)
         residual = out["rgb"] - rays.rgb  # (R,3)
-        error = residual.abs().mean(1)  # (R,) L1
         is_on = cfg.mask != "off"
-        mask = mask_at(self.mask.logits[pick], rays.uv) if is_on else torch.zeros_like(error)
-        kept = (1 - mask) * error  # (R,) what the mask leaves of it
+        mask = mask_at(self.mask.logits[pick], rays.uv) if is_on else torch.zeros_like(rays.near)
+        kept = (1 - mask) * residual.abs().mean(1)  # (R,) what the mask leaves of the L1 error
         sfm = self.sfm[torch.randint(len(self.sfm), (n,), generator=gen, device=gen.device)]
         cube = torch.empty(n, 3, device=gen.device).uniform_(-1, 1, generator=gen)
         x = torch.cat([taps(out["x"], self.eps).reshape(-1, 3), cube, sfm])
         ends, off, sfm = self.distance(x).split([5 * R, n, n])  # all points but the samples
         lap = finite_differences(ends.reshape(R, 5), self.eps)[1]  # (R,) where rays end
-        e_curv = lap.abs() * self.eps * out["opacity"]  # (R,) flat, not transparent [D13]
+        e_curv = lap.abs() * self.eps * out["opacity"]  # (R,) opacity: no gradient [D4] [D13]
         terms = dict(rgb=kept.mean(),
                      eik=out["eikonal"].mean(),
-                     curv=e_curv.mean(),  # [D4]
+                     curv=e_curv.mean(),
                      lps=torch.log(self.color.bounds()).sum(),  # [D5]
                      off=torch.exp(-50 * off.abs()).mean(),
                      sfm=self.deviation(SHARP).detach() * sfm.abs().mean())  # [D10]
@@ -838,14 +842,13 @@ class GeoNVS(nn.Module):
         return make_rays(self.scene, img, (u * wh[img].prod(1)).long()), pick
 
     def groups(self) -> list[dict]:
-        """Optimiser groups: what is looked up fast, networks slower, mask and zeta apart: eps
-        lets no vanishing gradient drive zeta away."""
+        """Optimiser groups: networks, lookup tables, which learn faster, zeta, and the mask. zeta's
+        larger eps keeps vanishing gradients from driving it away."""
         tables = [self.appearance.weight, *(o.features for o in self.octrees)]
-        mask = list(self.mask.parameters())
-        taken = {id(p) for p in [*tables, *mask, self.deviation.v]}
-        nets = [p for p in self.parameters() if id(p) not in taken]
+        mask, v = list(self.mask.parameters()), self.deviation.v
+        nets = [p for p in self.parameters() if all(p is not q for q in (*tables, *mask, v))]
         return [dict(params=nets, lr=self.cfg.lr_net), dict(params=tables, lr=self.cfg.lr_grid),
-                dict(params=[self.deviation.v], lr=self.cfg.lr_zeta, eps=1e-8),
+                dict(params=[v], lr=self.cfg.lr_zeta, eps=1e-8),
                 dict(params=mask, lr=8e-3)]  # learns in few steps [D14]
 
     def start(self, gen: torch.Generator, steps: int = 200, radius: float = 0.25) -> None:
@@ -863,22 +866,20 @@ class GeoNVS(nn.Module):
 
     @torch.no_grad()
     def plan(self, is_last: bool) -> dict:
-        """How to fit the model to the scene: split keys, and at last whether a mask is needed."""
-        cfg, octree, zeta, mask = self.cfg, self.sdf.octree, float(self.deviation()), self.cfg.mask
-        keys = octree.split_keys
-        if cfg.grid == "octree":
-            keys = refined_keys(octree, self.distance, self.hits, zeta, cfg.max_mb)
+        """How to fit the model to the scene: split keys; if is_last, whether it needs a mask."""
+        cfg, octree, mask = self.cfg, self.sdf.octree, self.cfg.mask
+        keys = octree.split_keys if cfg.grid == "uniform" else refined_keys(
+            octree, self.distance, self.hits, float(self.deviation()), cfg.max_mb)
         if is_last and mask == "auto":
             logits = self.mask.logits[self.scene.photos(False)]  # (B,1,m,m)
             share = logits[logits != -9].sigmoid().mean().item()  # of photos that it has seen
-            mask = "on" if share > 0.01 else "off"
+            mask = "on" if share > 0.01 else "off"  # [D16]
             print(f"  mean mask {share:.4f}: mask {mask}")
         return dict(keys=keys.cpu(), mask=mask)
 
     def follow(self, plan: dict, optimizer: torch.optim.Optimizer) -> None:
         """Carries out a plan; Adam's moments move along with their features."""
-        octree, self.cfg.mask = self.sdf.octree, plan["mask"]
-        old = octree.features
+        octree, old, self.cfg.mask = self.sdf.octree, self.sdf.octree.features, plan["mask"]
         old_row = octree.build(plan["keys"].to(old.device))
         moments = optimizer.state.pop(old, {}).items()
         optimizer.state[octree.features] = {k: v[old_row] if v.dim() else v for k, v in moments}
@@ -891,7 +892,7 @@ class GeoNVS(nn.Module):
 
     def render(self, rays: Rays, code: Tensor) -> dict[str, Tensor]:
         """render_rays without jitter, for pictures and for fitting codes."""
-        shape = len(rays.o), self.cfg.samples + self.cfg.bg_samples  # R, S+B
+        shape = len(rays.o), self.cfg.samples + self.cfg.bg_samples  # S and the background's
         return render_rays(self, rays, code, rays.o.new_full(shape, 0.5))
 
 
@@ -914,10 +915,10 @@ def open_counter(device: torch.device, rapl: str = "/sys/class/powercap"):
 
 
 class EnergyMeter:
-    """Joules counted from tick to tick; None, never 0, from where on nothing counts. A counter that
-    starts again from zero between two ticks loses what it counted there."""
-    def __init__(self, device: torch.device, counter=None):
-        self.device, self.counter, self.joules, self.last = device, counter, 0.0, None
+    """Joules counted from tick to tick, on top of those given; None, never 0, from where on nothing
+    counts. A counter that starts again from zero between two ticks loses what it counted there."""
+    def __init__(self, device: torch.device, joules: float | None = 0.0, counter=None):
+        self.device, self.joules, self.counter, self.last = device, joules, counter, None
         self.source = f"{'nvml' if device.type == 'cuda' else 'rapl'} counter, read every 5 s"
 
     def tick(self) -> None:
@@ -1033,8 +1034,9 @@ def train(cfg: Config, scene: Scene, run: Path, saved: dict | None = None, kind=
     torch.set_flush_denormal(True)  # vanishing weights would otherwise slow a CPU down
     torch.manual_seed(cfg.seed)
     gen = torch.Generator(scene.c2w.device).manual_seed(cfg.seed)
-    model, meter, terms = kind(cfg, scene), EnergyMeter(scene.c2w.device), {}
     state = dict(step=0, refined=0, seconds=0.0, dropped=0, joules=0.0)
+    state |= saved["state"] if saved else {}
+    model, meter, terms = kind(cfg, scene), EnergyMeter(scene.c2w.device, state["joules"]), {}
     meter.tick()
     if saved is None:  # nothing of a former run may be taken for this one's
         for name in "checkpoint.pt log.jsonl metrics.json panel.png mesh.ply film.mp4".split():
@@ -1042,14 +1044,13 @@ def train(cfg: Config, scene: Scene, run: Path, saved: dict | None = None, kind=
         model.start(gen)
         optimizer = torch.optim.Adam(model.groups(), **model.adam, fused=True)
     else:
-        optimizer, state = restore(saved, path, model, gen), state | saved["state"]
+        optimizer = restore(saved, path, model, gen)
     for value in model.state_dict().values() if RANKS > 1 else ():
         dist.broadcast(value, 0)
     if RANK:
         gen.manual_seed(cfg.seed + RANK + RANKS * state["step"])  # own rays for each process
-    photos, begin, spent = scene.photos(False), begin - state["seconds"], state["joules"]
+    photos, begin, streak = scene.photos(False), begin - state["seconds"], 0  # void steps in a row
     next_line, next_save = state["seconds"] + 5, state["seconds"] + 60
-    streak = 0  # void steps in a row
     while True:
         seconds = agreed(time.perf_counter() - begin)
         progress = seconds / (60 * cfg.minutes) if cfg.minutes else state["step"] / cfg.steps
@@ -1058,9 +1059,8 @@ def train(cfg: Config, scene: Scene, run: Path, saved: dict | None = None, kind=
         if is_over or seconds > next_line:
             state["dropped"] = int(state["dropped"])  # waits for a GPU's queue
             meter.tick()
-            joules = None if None in (spent, meter.joules) else spent + meter.joules
-            state |= dict(joules=joules, energy_wh=joules and joules / 3600, source=meter.source,
-                          seconds=agreed(time.perf_counter() - begin))
+            state |= dict(joules=meter.joules, energy_wh=meter.joules and meter.joules / 3600,
+                          source=meter.source, seconds=agreed(time.perf_counter() - begin))
             RANK or report(model, run / "log.jsonl", progress, state, terms)
             next_line = seconds + 5
             if is_over or seconds > next_save:
@@ -1109,13 +1109,6 @@ def psnr(a, b) -> float:
     return -10 * math.log10(max(float(((a - b) ** 2).mean()), 1e-10))
 
 
-def ssim(a: np.ndarray, b: np.ndarray) -> float | None:
-    """SSIM of two pictures in 0..1: Gaussian window of 11 px, sigma 1.5, no border, or None."""
-    how = dict(channel_axis=2, data_range=1, gaussian_weights=True, sigma=1.5)
-    return float(structural_similarity(a, b, use_sample_covariance=False, **how)) if min(
-        a.shape[:2]) >= 11 else None
-
-
 def make_lpips(device):
     """Learned perceptual distance of two pictures in 0..1 (AlexNet, v0.1), or None with a line."""
     try:
@@ -1158,23 +1151,28 @@ def render_photo(model, scene: Scene, photo: int, code: Tensor) -> dict[str, np.
     """A photo's view under an appearance code (A,): arrays (H,W,...) by name of render_rays, and
     `truth` (H,W,3)."""
     (w, h), parts = scene.wh[photo].tolist(), []
-    size = CHUNK if scene.c2w.is_cuda else CHUNK // 8  # launches bind a GPU, its cache a CPU
+    size = CHUNK if scene.c2w.is_cuda else CHUNK // 8  # as in SDFCache.refresh
     for pixel in torch.arange(w * h, device=scene.c2w.device).split(size):
         rays = make_rays(scene, torch.full_like(pixel, photo), pixel)
         out = model.render(rays, code.expand(len(pixel), -1)) | dict(truth=rays.rgb)
         parts.append({k: v for k, v in out.items() if v[0].numel() in (1, 3)})  # not the samples'
-    whole = {k: torch.cat([p[k] for p in parts]).cpu().numpy() for k in parts[0]}
-    return {k: v.reshape(h, w, *v.shape[1:]) for k, v in whole.items()}
+    return {k: torch.cat([p[k] for p in parts]).reshape(h, w, *v.shape[1:]).cpu().numpy()
+            for k, v in parts[0].items()}
 
 
 def score(frame: dict[str, np.ndarray], lpips=None) -> dict:
     """The right half of a rendered photo [D12] against the truth, both rounded to 8 bits, beside
-    the trivial predictor: the mean colour of each row of the left half."""
+    the trivial predictor: the mean colour of each row of the left half. SSIM: Gaussian window of
+    11 px, sigma 1.5, no border. None where a picture is too small."""
     half = frame["rgb"].shape[1] // 2
     flat = np.broadcast_to(frame["truth"][:, :half].mean(1, keepdims=True), frame["truth"].shape)
     got, want, flat = (to_uint8(p)[:, half:] / 255 for p in (frame["rgb"], frame["truth"], flat))
-    return dict(psnr=psnr(got, want), psnr_floor=psnr(flat, want), ssim=ssim(got, want),
-                lpips=lpips(got, want) if lpips and min(got.shape[:2]) >= 32 else None)
+    ssim, side = functools.partial(
+        structural_similarity, channel_axis=2, data_range=1, gaussian_weights=True, sigma=1.5,
+        use_sample_covariance=False), min(got.shape[:2])
+    return dict(psnr=psnr(got, want), psnr_floor=psnr(flat, want),
+                ssim=float(ssim(got, want)) if side >= 11 else None,
+                lpips=lpips(got, want) if lpips and side >= 32 else None)
 
 
 def evaluate(model, scene: Scene, lpips=None) -> dict:
@@ -1347,7 +1345,7 @@ def film(model, scene: Scene, path: Path, rays: float = 4e6) -> None:
 def make_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0], allow_abbrev=False,
                                      argument_default=argparse.SUPPRESS,
-                                     epilog="[R] is open in the paper; [Dn]: see geonvs.py's head")
+                                     epilog="[Dn]: see geonvs.py's head")
     parser.error = lambda message: need(False, f"{message}: see python geonvs.py --help")
     for f in fields(Config):
         parser.add_argument(f"--{f.name}", type=type(f.default), choices=f.metadata["choices"],
