@@ -31,12 +31,12 @@ Where the printed paper is departed from, the line carries its tag:
   [D8]  the background also fills what lies before the sphere; its last section is opaque
   [D9]  all is float32: mixed precision, as the paper has it, makes noise of distances and normals
   [D10] SfM points place the sphere, seed the octree, teach M = 0 and pull s(p) to zero, but less
-        while the surface is fog: a strong pull would leave it so
+        while zeta is below 40: a strong pull would leave the surface fog
   [D11] samples are drawn from a cached SDF volume; no second network pass along the ray
   [D12] test photos: appearance fitted on the left half, scored on the right half
   [D13] exact normals by trilinear weights (--normals fd: as printed); curvature where a ray ends
   [D14] the mask learns every few steps, by a logistic surrogate, from averaged errors of photos
-  [D15] zeta has a rising floor, which only a surface that stays fog among people ever meets
+  [D15] zeta has a rising floor, which lifts a surface that is slow to leave the fog out of it
   [D16] cells split where colours err and merge far from surfaces; a scene that needs no codes, no
         mask or no background field is modelled without
 """
@@ -70,7 +70,7 @@ def opt(default, text, *choices):
 
 @dataclass
 class Config:
-    """All settings. The paper gives lam_gpl and leaves the others open."""
+    """All settings. Of the weights and sizes the paper gives lam_gpl alone."""
     scene: str = opt("toy", "synthetic, or of Phototourism", "toy", *data_prep.SCENES)
     data: str = opt("", "an IMC-PT or COLMAP folder instead of a named scene")
     name: str = opt("", "run folder below runs/ (default: scene-method-seed)")
@@ -444,8 +444,8 @@ class Deviation(nn.Module):
 
     @torch.no_grad()
     def rise(self, step: int) -> None:
-        """Lifts zeta to a floor of 15 at first, of 80 after 1,300 steps [D15]. In a crowd, fog
-        hides people from the mask, and people that it misses keep up the fog."""
+        """Lifts zeta to a floor of 15 at first, of 80 after 1,300 steps, whatever the budget [D15].
+        In a crowd, fog hides people from the mask, and people that it misses keep up the fog."""
         self.v.clamp_(min=math.log(min(15 + step / 20, 80)) / 10)
 
 
@@ -685,7 +685,8 @@ class TransientMask(nn.Module):
         self.calibration = nn.Buffer(torch.tensor([0.0, 1.0]))  # centre and width of Phi
         # running upper quartiles of errors at SfM points: beside the foreground, and of it
         self.usual = nn.Buffer(torch.full((2,), 0.3))
-        self.static = nn.Buffer(scene.is_test.new_zeros(I, 1, m, m))  # which pixels show SfM points
+        # which pixels show SfM points
+        self.static = nn.Buffer(scene.is_test.new_zeros(I, 1, m, m), persistent=False)
         ok = ((scene.track_uv >= 0) & (scene.track_uv < 1)).all(1)  # not those that SfM got wrong
         col, row = (scene.track_uv[ok] * m).long().unbind(1)  # (T,)
         self.static[scene.track_photo[ok], 0, row, col] = True  # but for some on outlines [D10]
@@ -846,7 +847,8 @@ class GeoNVS(nn.Module):
         larger eps keeps vanishing gradients from driving it away."""
         tables = [self.appearance.weight, *(o.features for o in self.octrees)]
         mask, v = list(self.mask.parameters()), self.deviation.v
-        nets = [p for p in self.parameters() if all(p is not q for q in (*tables, *mask, v))]
+        taken = {*map(id, (*tables, *mask, v))}
+        nets = [p for p in self.parameters() if id(p) not in taken]
         return [dict(params=nets, lr=self.cfg.lr_net), dict(params=tables, lr=self.cfg.lr_grid),
                 dict(params=[v], lr=self.cfg.lr_zeta, eps=1e-8),
                 dict(params=mask, lr=8e-3)]  # learns in few steps [D14]
@@ -905,8 +907,8 @@ def open_counter(device: torch.device, rapl: str = "/sys/class/powercap"):
         import pynvml
         pynvml.nvmlInit()
         used = range(RANKS) if RANKS > 1 else [device]  # the first process speaks for all
-        uuids = [torch.cuda.get_device_properties(gpu).uuid for gpu in used]
-        gpus = [pynvml.nvmlDeviceGetHandleByUUID(f"GPU-{uuid}") for uuid in uuids]
+        gpus = [pynvml.nvmlDeviceGetHandleByUUID(
+            f"GPU-{torch.cuda.get_device_properties(gpu).uuid}") for gpu in used]
         return lambda: sum(map(pynvml.nvmlDeviceGetTotalEnergyConsumption, gpus)) / 1e3  # mJ
     packages = [p for p in Path(rapl).glob("intel-rapl:*")  # not their parts, nor the platform
                 if (p / "name").read_text().startswith("package")]
@@ -919,7 +921,7 @@ class EnergyMeter:
     counts. A counter that starts again from zero between two ticks loses what it counted there."""
     def __init__(self, device: torch.device, joules: float | None = 0.0, counter=None):
         self.device, self.joules, self.counter, self.last = device, joules, counter, None
-        self.source = f"{'nvml' if device.type == 'cuda' else 'rapl'} counter, read every 5 s"
+        self.source = {"cuda": "nvml"}.get(device.type, "rapl") + " counter, read every 5 s"
 
     def tick(self) -> None:
         """Adds what was spent since the last tick. A failing reading ends metering, not the run."""
@@ -932,7 +934,7 @@ class EnergyMeter:
             self.last = now
         except Exception as error:  # a package, a driver's answer or a permission is missing
             print(f"  energy is null ({error}); a GPU's needs: pip install nvidia-ml-py")
-            self.source = self.joules = None
+            self.joules = None
 
 
 # ---- 9 Training ----------------------------------------------------------------------------------
@@ -1060,7 +1062,8 @@ def train(cfg: Config, scene: Scene, run: Path, saved: dict | None = None, kind=
             state["dropped"] = int(state["dropped"])  # waits for a GPU's queue
             meter.tick()
             state |= dict(joules=meter.joules, energy_wh=meter.joules and meter.joules / 3600,
-                          source=meter.source, seconds=agreed(time.perf_counter() - begin))
+                          source=None if meter.joules is None else meter.source,
+                          seconds=agreed(time.perf_counter() - begin))
             RANK or report(model, run / "log.jsonl", progress, state, terms)
             next_line = seconds + 5
             if is_over or seconds > next_save:
@@ -1125,15 +1128,12 @@ def fit_codes(model, scene: Scene, photos: Tensor, steps: int = 128, n: int = 0)
     """Appearance codes (B,A) of unseen photos (B,): Adam on n random rays a step of each left half
     (64, on a GPU 512) [D12], from the mean code of the training photos. The scene stays as is."""
     gen, n = torch.Generator(scene.c2w.device).manual_seed(0), n or (512 if photos.is_cuda else 64)
-    codes = model.codes()[~scene.is_test].mean(0).expand(len(photos), -1)  # (B,A)
-    codes = codes.detach().clone().requires_grad_()
-    if codes.numel() == 0:
-        return codes
+    codes = model.codes().detach()[~scene.is_test].mean(0).repeat(len(photos), 1)  # (B,A)
+    adam = torch.optim.Adam([codes.requires_grad_()])
     img = photos.repeat_interleave(n)  # (Bn,)
     size = torch.stack([scene.wh[img, 0] // 2, scene.wh[img, 1]], 1)  # (Bn,2) of the left halves
-    adam = torch.optim.Adam([codes], lr=0.1)
     model.requires_grad_(False)
-    for step in tell(range(steps), "fitting the light of held-out photos"):
+    for step in tell(range(steps if codes.numel() else 0), "fitting the light of held-out photos"):
         adam.param_groups[0]["lr"] = 0.1 * 0.1 ** (step / steps)
         u = torch.rand(size.shape, generator=gen, device=gen.device, dtype=torch.float64)
         col, row = (u * size).long().unbind(1)  # (Bn,)
@@ -1167,11 +1167,10 @@ def score(frame: dict[str, np.ndarray], lpips=None) -> dict:
     half = frame["rgb"].shape[1] // 2
     flat = np.broadcast_to(frame["truth"][:, :half].mean(1, keepdims=True), frame["truth"].shape)
     got, want, flat = (to_uint8(p)[:, half:] / 255 for p in (frame["rgb"], frame["truth"], flat))
-    ssim, side = functools.partial(
-        structural_similarity, channel_axis=2, data_range=1, gaussian_weights=True, sigma=1.5,
-        use_sample_covariance=False), min(got.shape[:2])
-    return dict(psnr=psnr(got, want), psnr_floor=psnr(flat, want),
-                ssim=float(ssim(got, want)) if side >= 11 else None,
+    how = dict(channel_axis=2, data_range=1, gaussian_weights=True, sigma=1.5)
+    ssim, side = functools.partial(structural_similarity, **how), min(got.shape[:2])
+    return dict(psnr=psnr(got, want), psnr_floor=psnr(flat, want), ssim=None if side < 11 else
+                float(ssim(got, want, use_sample_covariance=False)),
                 lpips=lpips(got, want) if lpips and side >= 32 else None)
 
 
@@ -1233,19 +1232,20 @@ def extract_mesh(model: GeoNVS, resolution: int = 0) -> tuple[np.ndarray, np.nda
     if not (volume < 0).any():
         return np.zeros((0, 3)), np.zeros((0, 3), int)
     vertices, faces, _, _ = marching_cubes(volume.cpu().numpy(), 0, gradient_direction="descent")
-    keep = np.linalg.norm(vertices * (2 / n) - 1, axis=1) < 1 - 4 / n  # not what the sphere closes
+    vertices = vertices * (2 / n) - 1
+    keep = np.linalg.norm(vertices, axis=1) < 1 - 4 / n  # not what the sphere closes
     faces = (keep.cumsum() - 1)[faces[keep[faces].all(1)]]
-    return (vertices[keep] * (2 / n) - 1) * scene.raw["scale"] + scene.raw["center"], faces
+    return vertices[keep] * scene.raw["scale"] + scene.raw["center"], faces
 
 
 def write_ply(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
-    """Binary PLY."""
+    """Binary PLY; double, as coordinates of a map would lose their metres."""
     f = np.empty(len(faces), [("n", "u1"), ("index", "<i4", 3)])
     f["n"], f["index"] = 3, faces
     header = ("ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}",
-              *[f"property float {k}" for k in "xyz"], f"element face {len(f)}",
+              *[f"property double {k}" for k in "xyz"], f"element face {len(f)}",
               "property list uchar int vertex_indices", "end_header\n")
-    data = "\n".join(header).encode() + vertices.astype("<f4").tobytes() + f.tobytes()
+    data = "\n".join(header).encode() + vertices.astype("<f8").tobytes() + f.tobytes()
     atomic_write(path, lambda tmp: tmp.write_bytes(data))
 
 
@@ -1254,15 +1254,15 @@ def panel(model, frames: list[tuple[int, str, dict]], width: int = 240) -> np.nd
     normals of the surface and what the mask network says of the photo."""
     rows = []
     for i, name, f in frames:
-        tiles, height = {name: f["truth"], "render": f["rgb"]}, round(
-            width * f["rgb"].shape[0] / f["rgb"].shape[1])
+        tiles = {name: f["truth"], "render": f["rgb"]}
         if hasattr(model, "sdf"):
             tiles["normals"] = f["normal"] / 2 + 0.5
         if hasattr(model, "sdf") and model.cfg.mask != "off":
             M = to_uint8(model.mask.look([i])[0, 0].sigmoid().detach().cpu().numpy())  # (m,m)
             M = cv2.applyColorMap(M, cv2.COLORMAP_VIRIDIS)[:, :, ::-1] / 255  # (m,m,3)
             tiles["mask: yellow is transient"] = M
-        row = [np.pad(cv2.resize(to_uint8(tile), (width, height), interpolation=cv2.INTER_AREA),
+        size = width, round(width * f["rgb"].shape[0] / f["rgb"].shape[1])
+        row = [np.pad(cv2.resize(to_uint8(tile), size, interpolation=cv2.INTER_AREA),
                       ((20, 4), (0, 4), (0, 0)), constant_values=255) for tile in tiles.values()]
         for title, tile in zip(tiles, row):
             cv2.putText(tile, title, (2, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.4, (0, 0, 0), 1, 16)
@@ -1288,7 +1288,7 @@ def finish(model, scene: Scene, state: dict, run: Path) -> dict:
     picture = panel(model, frames)[:, :, ::-1]
     atomic_write(run / "panel.png", lambda tmp: cv2.imwrite(str(tmp), picture))
     parameters = sum(p.numel() for p in model.parameters())
-    git = ["git", "-C", Path(__file__).parent, "rev-parse", "--short", "HEAD"]
+    git = "git", "-C", Path(__file__).parent, "describe", "--always", "--dirty", "--exclude=*"
     metrics = dict(
         scene=scene.info["scene"], method=model.name, seed=cfg.seed, steps=state["step"],
         device=(torch.cuda.get_device_name(scene.c2w.device) if is_gpu else
@@ -1423,8 +1423,11 @@ def run_command_line(entry) -> None:
         return
     except UserError as error:
         message = str(error)
-    except (torch.OutOfMemoryError, MemoryError):
-        message = "the memory is full: lower --samples, --max_mb or --rays, or larger --downscale"
+    except (RuntimeError, MemoryError) as error:  # a CPU's allocator has no error of its own
+        if type(error) is RuntimeError and "allocate memory" not in str(error):
+            raise
+        message = ("the memory is full: go on with fewer --samples, or begin anew with fewer "
+                   "--rays, a lower --max_mb or a larger --downscale")
     except OSError as error:  # a full disk, a folder without permission
         message = f"{error}: free or choose a place, then go on with --resume"
     except KeyboardInterrupt:
