@@ -27,7 +27,7 @@ FORMAT = dict(
     wh="int32 I2", K="float64 I4",   # width, height; fx fy cx cy [px]; first pixel's centre 0.5 0.5
     c2w="float64 I34",   # camera to world; OpenCV: x right, y down, z forward
     is_test="bool I", name="<U I",   # held out from training; file name
-    points="float32 K3", center="float64 3", scale="float64",   # SfM; world = x * scale + center
+    points="float32 K3", center="float64 3", scale="float64",   # SfM units: x * scale + center
     track_photo="int32 T", track_point="int32 T", track_uv="float32 T2",   # see statistics
     near="float32 I", footprint="float64", exposure_spread="float64", bg_color="float64 3",
     info="<U")   # JSON: scene, kind (toy or colmap), downscale, folder, split; of a toy its knobs
@@ -56,7 +56,6 @@ def tell(items, what):
 
 def atomic_write(path, write):
     """write(temporary path), then rename: `path` is the whole old file or the whole new one."""
-    path = Path(path)
     part = path.with_name(f".{path.stem}.{os.getpid()}.{time.time_ns()}{path.suffix}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -97,7 +96,8 @@ def read_scene(path):
         need(start[0] == 0 and (wh > 0).all() and (np.diff(start) == wh.prod(1)).all(), "start")
         need(np.min(seen) >= 0 and (np.max(seen, 1) < (size["I"], size["K"])).all(), "tracks")
         need(min(scene["footprint"], scene["scale"]) > 0 and not scene["is_test"].all(), "scale")
-        need({"kind", "downscale", "folder", "split"} <= {*json.loads(str(scene["info"]))}, "info")
+        info = json.loads(str(scene["info"]))
+        need({"kind", "scene", "downscale", "folder", "split"} <= {*info}, "info")
     except Exception as e:   # a damaged file can fail in any layer: zip, array header, dtype, text
         raise UserError(f"{path} is no whole scene, or too large: delete it, it is remade") from e
     return scene
@@ -163,7 +163,7 @@ def part_sdf(part, x):
 
 
 def toy_sdf(x_world, background=True, landmark=0):
-    """Signed distance of the toy, + and exact outside, world units. (P,3) -> (P,) float64"""
+    """Signed distance of the toy, + and exact outside, SfM units. (P,3) -> (P,) float64"""
     x = (np.asarray(x_world, np.float64) - TOY_ORIGIN) / TOY_SCALE
     parts = [part_sdf(part, x) for part in toy_parts(landmark, background)]
     return np.min([*parts, x[:, 2]] if background else parts, axis=0) * TOY_SCALE
@@ -341,7 +341,7 @@ def make_toy(seed=0, size=96, photos=48, test=8, occluders=0.05, exposure=1.0, p
 
 
 def finish(images, K, c2w, is_test, name, points, tracks, info, contain=()):
-    """The scene of images (h,w,3), each of which observes the points tracks (M,). World units: c2w;
+    """The scene of images (h,w,3), each of which observes the points tracks (M,). SfM units: c2w;
     points (K,5): x y z, error [px], views; contain (P,3). Unit sphere: geometric median of points
     by views, 1.1 x the distance of 95 %; contain; 30 % of 9 in 10 training photos' own. [D10]"""
     error, views, rng = points[:, 3], points[:, 4], np.random.default_rng(0)
@@ -422,7 +422,7 @@ MODELS = {0: "f", 1: "ff", 2: "fk", 3: "fkk", 4: "ffkkpp"}   # f, then cx cy, th
 
 
 def read_colmap(sparse):
-    """A COLMAP model, world units. -> points (K,5) as in finish, photos {name: ((w, h, K (4,), k1
+    """A COLMAP model, SfM units. -> points (K,5) as in finish, photos {name: ((w, h, K (4,), k1
     k2 p1 p2 (4,)), c2w (3,4), points (M,) that it observes)}"""
     take, cameras, photos, index, points = open_binary(sparse / "points3D.bin"), {}, {}, {}, []
     for _ in range(*take("Q")):
@@ -598,15 +598,15 @@ def download(name, archive_url=ARCHIVE_URL, split_url=SPLIT_URL):
 def run_sfm(folder):
     """Poses for the raw photos in `folder`, by pycolmap -> folder/dense/{images,sparse}"""
     import pycolmap   # an extra: main says when it is not there
-    need(folder.is_dir() and not (folder / "dense").exists(), f"{folder} is missing, or has dense/")
-    database, models = folder / "database.db", folder / "models"
+    database, models, dense = (folder / name for name in ("database.db", "models", "dense"))
+    need(folder.is_dir() and not dense.exists(), f"{folder} is missing, or has dense/: delete that")
     models.mkdir(exist_ok=True)
     pycolmap.extract_features(database, folder)
     pycolmap.match_exhaustive(database)
     found = pycolmap.incremental_mapping(database, folder, models)
     need(found, f"the photos in {folder} do not match each other; take more, with more overlap")
     best = max(found, key=lambda i: found[i].num_reg_images())
-    pycolmap.undistort_images(folder / "dense", models / str(best), folder)
+    pycolmap.undistort_images(dense, models / str(best), folder)
 
 
 def main(argv=None):

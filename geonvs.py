@@ -16,18 +16,18 @@ Conventions
   rays      r(t) = o + t d with |d| = 1, so t is a distance along the ray and not a z-depth
   sdf       positive outside; the normal is the unit gradient; colours are sRGB in [0, 1]
   mask      M = 1 means transient (person, car), M = 0 means scene
-  shapes    R rays, S samples per ray, P points, N cells or pixels, L octree levels, C channels per
-            level, V rows of features, H hidden width, G what colour is read from, A appearance
-            dims, B photos of all I, K SfM points, T sightings of them, m side of a mask
+  shapes    R rays, S samples per ray, P points, N cells, pixels or sections, L octree levels, C
+            channels per level, V rows of features, H hidden width, G what colour is read from, A
+            appearance dims, B photos of all I, K SfM points, T sightings of them, m side of a mask
 
 Where the printed paper is departed from, the line carries its tag:
-  [D1]  alpha is divided by sigmoid(zeta s_prev) and never negative (printed: a wall is 63 % opaque)
+  [D1]  alpha is divided by sigmoid(zeta s_prev), never negative (printed: a wall is 63 % opaque)
   [D2]  the slope correction sits inside zeta, with opposite signs for the two ends of a section
-  [D3]  Phi: NeuS-weighted E_grad, |lap| eps opacity, set by quantiles, detached, times opacity
+  [D3]  Phi: E_grad weighted by w, |lap| eps opacity, sigmoid set by quantiles, detached, x opacity
   [D4]  the curvature loss is |lap| eps opacity: |lap| of a trilinear field grows as eps shrinks
   [D5]  the Lipschitz term is a sum of logs, not a product that can drown the colour at first
-  [D6]  CGNet: GroupNorm, ReLU, half width, one block a stage, no residual, low bias, finer head
-  [D7]  the mask pays M, not M^2, as the error is L1: lam_mask more than most SfM pixels err by
+  [D6]  a small CGNet on small square photos: one plain block a stage, GroupNorm, ReLU, finer head
+  [D7]  masking costs M, not M^2, as the error is L1: lam_mask + what most SfM pixels err by
   [D8]  the background also fills what lies before the sphere; its last section is opaque
   [D9]  all is float32: mixed precision, as the paper has it, makes noise of distances and normals
   [D10] SfM points place the sphere, seed the octree, teach M = 0 and pull s(p) to zero, but less
@@ -36,11 +36,11 @@ Where the printed paper is departed from, the line carries its tag:
   [D12] test photos: appearance fitted on the left half, scored on the right half
   [D13] exact normals by trilinear weights (--normals fd: as printed); curvature where a ray ends
   [D14] the mask learns every few steps, by a logistic surrogate, from averaged errors of photos
-  [D15] zeta has a rising floor, which lifts a surface that is slow to leave the fog out of it
+  [D15] zeta has a rising lower limit, so that a surface that is slow to leave the fog does so
   [D16] cells split where colours err and merge far from surfaces; a scene that needs no codes, no
         mask or no background field is modelled without
 """
-import argparse, datetime, functools, gc, io, json, math, os
+import argparse, datetime, functools, gc, io, json, math, os, re
 import resource, shutil, subprocess, sys, time
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
@@ -152,7 +152,7 @@ def load_scene(raw: dict, device="cpu") -> Scene:
     """Scene from the dictionary of a scene file (data_prep.open_scene, make_toy or prepare)."""
     photos = [raw["rgb"][a:b].reshape(h, w, 3)
               for a, b, (w, h) in zip(raw["start"], raw["start"][1:], raw["wh"])]
-    side = int(np.clip(np.median(raw["wh"].max(1)) / 2, 96, 256))  # px that the mask network sees
+    side = int(np.clip(np.median(raw["wh"].max(1)) / 2, 96, 256))  # what the mask network sees [D6]
     thumbs = [cv2.resize(p, (side, side), interpolation=cv2.INTER_AREA) for p in photos]
     thumbs = torch.as_tensor(np.stack(thumbs)).permute(0, 3, 1, 2).contiguous().to(device)
     kinds = dict(i=torch.long, f=torch.float32)  # uint8 and bool stay what they are
@@ -323,7 +323,7 @@ def seed_octree(octree: Octree, points: Tensor, dense: int, near: int = 1) -> No
         octree.split(octree.cells)
     step = torch.cartesian_prod(*[torch.arange(-1, 2, device=points.device)] * 3)  # (27,3)
     for _ in range(near):
-        home = octree.cells[octree.locate(points)[0][:, -1] - 8]  # (P,4)
+        home = octree.cells[octree.locate(points)[0][:, -1].unique() - 8]  # (N,4)
         octree.split(home[:, None] + F.pad(step, (1, 0)))
     octree.features.data[PINNED:].normal_(0, 0.01)
 
@@ -467,7 +467,7 @@ def printed_alpha(sdf: Tensor, cos: Tensor, dt: Tensor, zeta: Tensor) -> Tensor:
 
 def composite(alpha: Tensor) -> tuple[Tensor, Tensor]:
     """Weights w_i = T_i alpha_i (R,S), T_i = prod_{j<i} (1 - alpha_j); what passes, T (R,). Eq. 2
-    A sum of logs: its backward needs no look for zeros; opaque sections still pass 1e-6."""
+    A sum of logs: its backward needs no look for zeros; opaque sections still pass 1e-6 [D1]."""
     passes = torch.log1p((1e-6 - 1) * alpha)  # (R,S) log of what passes a section
     w = torch.exp(passes.cumsum(1) - passes) * alpha  # (R,S)
     return w, 1 - w.sum(1)
@@ -689,7 +689,7 @@ class TransientMask(nn.Module):
         self.static = nn.Buffer(scene.is_test.new_zeros(I, 1, m, m), persistent=False)
         ok = ((scene.track_uv >= 0) & (scene.track_uv < 1)).all(1)  # not those that SfM got wrong
         col, row = (scene.track_uv[ok] * m).long().unbind(1)  # (T,)
-        self.static[scene.track_photo[ok], 0, row, col] = True  # but for some on outlines [D10]
+        self.static[scene.track_photo[ok], 0, row, col] = True  # a few wrongly, on outlines [D10]
 
     def look(self, pick: Tensor) -> Tensor:
         """Logits (B,1,m,m) of photos (B,)."""
@@ -714,10 +714,10 @@ class TransientMask(nn.Module):
         return opacity.clamp(min=0) * edge_indicator(bend, self.calibration)  # [D3]
 
     def objective(self, pick: Tensor) -> tuple[Tensor, Tensor]:
-        """The terms of Eq. 5 that hold M, over the pixels of photos (B,) that rays have seen, and
-        L_GPL alone. M = 1 costs a price and saves the error, a signed mean over 3x3 pixels of the
-        worst channel: what a blurred model lacks cancels, people do not. At pixels that show SfM
-        points M saves nothing; their errors set the price. The logistic surrogate of (price -
+        """The terms of Eq. 5 that hold M, over photos (B,), a pixel that no ray has seen being 0,
+        and L_GPL alone. M = 1 costs a price and saves the error, a signed mean over 3x3 pixels of
+        the worst channel: what a blurred model lacks cancels, people do not. At pixels that show
+        SfM points M saves nothing; their errors set the price. The logistic surrogate of (price -
         error) M has its sign and optimum, and a slope while M is wrong, where a sigmoid has none
         [D14]. --mask printed has none of this: mean M^2 is the price, as in Ha-NeRF."""
         cfg, logits, phi = self.cfg, self.look(pick), self.phi(pick)  # (B,1,m,m)
@@ -796,8 +796,8 @@ class GeoNVS(nn.Module):
         return self.sdf(x)[0]
 
     def losses(self, rays: Rays, pick: Tensor, step: int, gen: torch.Generator):
-        """The objective, Eq. 5: its weighted sum, and the raw terms by name. M is held fixed, but
-        for every few steps, when the terms that teach it are added [D14]. pick: photos (B,)."""
+        """The objective, Eq. 5: its weighted sum, and the raw terms by name. M is what the network
+        said of each photo of pick (B,) at its last lesson; now and then comes another [D14]."""
         cfg, R, n = self.cfg, len(rays.o), len(rays.o) // 2
         self.deviation.rise(step)
         if step % 8 == 0:  # an eighth of the cache
@@ -940,7 +940,7 @@ class EnergyMeter:
 # ---- 9 Training ----------------------------------------------------------------------------------
 
 REFINE_AT = (0.1, 0.2, 0.3, 0.45, 0.6)  # shares of training at which the octree is refined
-PATIENCE = 20  # steps in a row without a finite loss and gradient that stop a run
+PATIENCE = 20  # steps in a row without finite loss and gradient that stop a run, seen as often
 # torchrun starts RANKS processes. Each draws its own rays, the gradients are averaged, the first
 # process decides, speaks and writes; so all hold the same weights, but each what its rays found.
 RANK, LOCAL_RANK, RANKS = (int(os.environ.get(name, default)) for name, default in (
@@ -1142,7 +1142,8 @@ def fit_codes(model, scene: Scene, photos: Tensor, steps: int = 128, n: int = 0)
         adam.zero_grad()
         loss.backward()
         adam.step()
-    model.requires_grad_(True)
+    for p in model.parameters():
+        p.requires_grad_(p.numel() > 0)  # at 0 CUDA errs
     return codes.detach()
 
 
@@ -1335,7 +1336,8 @@ def film(model, scene: Scene, path: Path, rays: float = 4e6) -> None:
         for pose, code in tell(shots, f"filming {len(shots)} frames"):
             frame = render_photo(model, one._replace(c2w=pose[None]), 0, code)["rgb"]
             video.write(np.ascontiguousarray(to_uint8(frame)[:, :, ::-1]))
-        video.release()
+        video.release()  # without a word where the disk is full
+        return cv2.VideoCapture(str(tmp)).get(cv2.CAP_PROP_FRAME_COUNT) == len(shots)
     atomic_write(path, write)
     print(f"wrote {path}")
 
@@ -1345,7 +1347,7 @@ def film(model, scene: Scene, path: Path, rays: float = 4e6) -> None:
 def make_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0], allow_abbrev=False,
                                      argument_default=argparse.SUPPRESS,
-                                     epilog="[Dn]: see geonvs.py's head")
+                                     epilog=f"[Dn]: see geonvs.py's head. Photos on a GPU: {LARGE}")
     parser.error = lambda message: need(False, f"{message}: see python geonvs.py --help")
     for f in fields(Config):
         parser.add_argument(f"--{f.name}", type=type(f.default), choices=f.metadata["choices"],
@@ -1387,13 +1389,14 @@ def execute(cfg: Config, scene: Scene, run: Path, saved: dict | None = None, kin
 def main(argv: list[str] | None = None) -> None:
     given, saved = vars(make_parser().parse_args(argv)), None
     resume, render = (given.pop(k, False) for k in ("resume", "render"))
-    cfg = make_config(given)
+    finding = ("scene", "data", "name", "seed") if resume or render else given  # a run's folder
+    cfg = make_config({k: v for k, v in given.items() if k in finding})
     where = data_prep.scene_path(cfg.source).stem
     run = Path("runs") / (cfg.name or f"{where}-{GeoNVS.name}-{cfg.seed}")
     if resume or render:
         given = {"minutes": 0.0} | given if "steps" in given else given  # of budgets the last one
         saved, cfg = read_checkpoint(run / "checkpoint.pt", given)
-    need(cfg.rays % (cfg.photos * RANKS) == 0,
+    need(cfg.rays % (cfg.photos * RANKS) == 0 and cfg.rays >= 2 * RANKS,
          f"--rays {cfg.rays} must be a multiple of --photos {cfg.photos} times {RANKS} processes")
     device = pick_device(cfg.device)
     if device.type == "cuda":
@@ -1424,14 +1427,14 @@ def run_command_line(entry) -> None:
     except UserError as error:
         message = str(error)
     except (RuntimeError, MemoryError) as error:  # a CPU's allocator has no error of its own
-        if type(error) is RuntimeError and "allocate memory" not in str(error):
+        if not re.search("MemoryError|allocate memory|out of memory", repr(error)):
             raise
         message = ("the memory is full: go on with fewer --samples, or begin anew with fewer "
                    "--rays, a lower --max_mb or a larger --downscale")
     except OSError as error:  # a full disk, a folder without permission
         message = f"{error}: free or choose a place, then go on with --resume"
     except KeyboardInterrupt:
-        message = "stopped; a checkpoint is made every minute, --resume goes on from the last one"
+        message = "stopped; --resume goes on from the last checkpoint: training makes one a minute"
     print(f"error: {message}", file=sys.stderr)
     sys.exit(2)
 
