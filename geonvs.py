@@ -940,7 +940,7 @@ class EnergyMeter:
 # ---- 9 Training ----------------------------------------------------------------------------------
 
 REFINE_AT = (0.1, 0.2, 0.3, 0.45, 0.6)  # shares of training at which the octree is refined
-PATIENCE = 20  # steps in a row without finite loss and gradient that stop a run, seen as often
+PATIENCE = 20  # void steps (loss or gradient not finite) in a row that stop a run; seen every 20
 # torchrun starts RANKS processes. Each draws its own rays, the gradients are averaged, the first
 # process decides, speaks and writes; so all hold the same weights, but each what its rays found.
 RANK, LOCAL_RANK, RANKS = (int(os.environ.get(name, default)) for name, default in (
