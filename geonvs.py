@@ -36,7 +36,7 @@ Where the printed paper is departed from, the line carries its tag:
   [D12] test photos: appearance fitted on the left half, scored on the right half
   [D13] exact normals by trilinear weights (--normals fd: as printed); curvature where a ray ends
   [D14] the mask learns every few steps, by a logistic surrogate, from averaged errors of photos
-  [D15] zeta has a rising lower limit, so that a surface that is slow to leave the fog does so
+  [D15] zeta stays above a rising floor, so that no surface stays fog, and below a fixed bound
   [D16] cells split where colours err and merge far from surfaces; a scene that needs no codes, no
         mask or no background field is modelled without
 """
@@ -443,10 +443,11 @@ class Deviation(nn.Module):
         return torch.exp(10 * self.v).clamp(1e-2, most)
 
     @torch.no_grad()
-    def rise(self, step: int) -> None:
-        """Lifts zeta to a floor of 15 at first, of 80 after 1,300 steps, whatever the budget [D15].
-        In a crowd, fog hides people from the mask, and people that it misses keep up the fog."""
-        self.v.clamp_(min=math.log(min(15 + step / 20, 80)) / 10)
+    def bound(self, step: int, most: float) -> None:
+        """Lifts zeta to a floor of 15 at first, of 80 after 1,300 steps, whatever the budget: in a
+        crowd, fog hides people from the mask, and people that it misses keep up the fog. Keeps it
+        below `most`: shards in the air that hardly a sample meets would stay for good. [D15]"""
+        self.v.clamp_(math.log(min(15 + step / 20, 80)) / 10, math.log(most) / 10)
 
 
 def neus_alpha(sdf: Tensor, cos: Tensor, dt: Tensor, zeta: Tensor) -> Tensor:
@@ -799,7 +800,7 @@ class GeoNVS(nn.Module):
         """The objective, Eq. 5: its weighted sum, and the raw terms by name. M is what the network
         said of each photo of pick (B,) at its last lesson; now and then comes another [D14]."""
         cfg, R, n = self.cfg, len(rays.o), len(rays.o) // 2
-        self.deviation.rise(step)
+        self.deviation.bound(step, 32 * cfg.samples)  # about 1 / the finest section
         if step % 8 == 0:  # an eighth of the cache
             self.cache.refresh(self.distance, step // 8 % 8, 8)
         jitter = torch.rand(R, cfg.samples + cfg.bg_samples, generator=gen, device=gen.device)

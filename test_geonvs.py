@@ -1252,8 +1252,8 @@ def test_deviation_starts_at_its_width_and_is_an_exponential_within_bounds():
     for v, want in ((0.4, math.e ** 4), (-50.0, 1e-2), (50.0, 1e5)):
         deviation.v.data.fill_(v)
         close(deviation(), want, rtol=1e-4)
-    for step, zeta, want in ((0, 3, 15), (200, 3, 25), (9000, 79, 80), (0, 15.1, 15.1), (9000, 81, 81)):  # a stalled
-        (deviation := g.Deviation(zeta)).rise(step)  # one is lifted, a healthy one is not moved
+    for step, zeta, want in ((0, 3, 15), (200, 3, 25), (9000, 79, 80), (0, 15.1, 15.1), (9000, 81, 81), (9, 1e3, 500)):
+        (deviation := g.Deviation(zeta)).bound(step, 500.0)  # a stalled one is lifted, a healthy one not moved
         close(deviation(), want, rtol=1e-4)
 
 
