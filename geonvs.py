@@ -27,7 +27,7 @@ Where the printed paper is departed from, the line carries its tag:
   [D4]  the curvature loss is |lap| eps opacity: |lap| of a trilinear field grows as eps shrinks
   [D5]  the Lipschitz term is a sum of logs, not a product that can drown the colour at first
   [D6]  a small CGNet on small square photos: one plain block a stage, GroupNorm, ReLU, finer head
-  [D7]  masking costs M, not M^2, as the error is L1: lam_mask + what most SfM pixels err by
+  [D7]  M, not M^2, as errors are L1, times lam_mask + lam_gpl Phi + what most SfM pixels err by
   [D8]  the background also fills what lies before the sphere; its last section is opaque
   [D9]  all is float32: mixed precision, as the paper has it, makes noise of distances and normals
   [D10] SfM points place the sphere, seed the octree, teach M = 0 and pull s(p) to zero, but less
@@ -107,10 +107,10 @@ class Config:
     lr_zeta: float = opt(1e-3, "learning rate of the deviation network")
 
     def __post_init__(self):  # refuses what cannot work, before anything is written
-        least = dict(samples=2, bg_samples=2, rays=2, photos=1, steps=1, downscale=1, hidden=1)
+        least = dict(samples=3, bg_samples=2, rays=2, photos=1, steps=1, downscale=1, hidden=1)
         for f in fields(self):
             value, low = getattr(self, f.name), least.get(f.name, 0)
-            is_right = isinstance(value, str) if f.type is str else low <= value < 2 ** 63
+            is_right = isinstance(value, str) if f.type is str else low <= value < 2 ** 31
             need(is_right and value in (f.metadata["choices"] or [value]),
                  f"--{f.name} {value} makes no sense: use a number from {low}, or see --help")
         need(self.rays % self.photos == 0, "--rays must be a multiple of --photos")
@@ -454,8 +454,8 @@ def neus_alpha(sdf: Tensor, cos: Tensor, dt: Tensor, zeta: Tensor) -> Tensor:
     Eq. 1 mended: 1 - sigmoid(zeta s_next) / sigmoid(zeta s_prev) (NeuS Eq. 13) [D1] with the two
     ends s -+ cos dt / 2 inside zeta [D2]. 0 where a ray leads outwards. Logs do not overflow."""
     half = F.relu(cos * (dt / -2))  # (R,S)
-    before, after = F.logsigmoid(zeta * torch.stack([sdf + half, sdf - half]))  # (R,S)
-    return -torch.expm1(after - before)
+    before, after = F.logsigmoid(zeta * torch.stack([sdf + half, sdf - half]))  # (R,S) [D2]
+    return -torch.expm1(after - before)  # [D1]
 
 
 def printed_alpha(sdf: Tensor, cos: Tensor, dt: Tensor, zeta: Tensor) -> Tensor:
@@ -571,7 +571,7 @@ def render_rays(model: "GeoNVS", rays: Rays, code: Tensor, jitter: Tensor) -> di
     cfg, R, S, zeta = model.cfg, len(rays.o), model.cfg.samples, model.deviation()
     t0, t1 = sphere_interval(rays)  # (R,)
     seen_zeta = zeta if cfg.sampling == "cached" else 0 * zeta  # 0: nothing is seen, even sections
-    edges = model.cache.edges(rays, t0, t1, jitter[:, :S], seen_zeta)  # (R,S+1)
+    edges = model.cache.edges(rays, t0, t1, jitter[:, :S], seen_zeta)  # (R,S+1) [D11]
     t = torch.lerp(edges[:, :-1], edges[:, 1:], 0.5)  # (R,S)
     x = rays.at(t).reshape(-1, 3)  # (RS,3)
     sdf, geo, grad = model.sdf(x, cfg.normals == "analytic")  # (RS,), (RS,G), (RS,3) [D13]
@@ -794,7 +794,7 @@ class GeoNVS(nn.Module):
         """The objective, Eq. 5: its weighted sum, and the raw terms by name. M is what the network
         said of each photo of pick (B,) at its last lesson; now and then comes another [D14]."""
         cfg, R, n = self.cfg, len(rays.o), len(rays.o) // 2
-        self.deviation.bound(step, 32 * cfg.samples)  # about 1 / the finest section
+        self.deviation.bound(step, 32 * cfg.samples)  # about 1 / the finest section [D15]
         if step % 8 == 0:  # an eighth of the cache
             self.cache.refresh(self.distance, step // 8 % 8, 8)
         jitter = torch.rand(R, cfg.samples + cfg.bg_samples, generator=gen, device=gen.device)
@@ -998,7 +998,8 @@ def read_checkpoint(path: Path, given: dict) -> tuple[dict, Config]:
         data_prep.refuse_bomb(path)
         saved = dict(torch.load(path, map_location="cpu", weights_only=True))
         cfg = Config(**saved["config"])
-        need(dict(saved["state"])["step"] >= 0, "")
+        counts = map(dict(saved["state"]).get, ("step", "refined", "seconds", "dropped"))
+        need(min(counts) >= 0, "")
     except Exception as error:  # a damaged file can fail in any layer: zip, pickle, tensor storage
         raise UserError(f"{path} is damaged, too large for the memory or of another program "
                         f"({type(error).__name__}): train again under another --name") from None
@@ -1126,7 +1127,7 @@ def fit_codes(model, scene: Scene, photos: Tensor, steps: int = 128, n: int = 0)
     codes = model.codes().detach()[~scene.is_test].mean(0).repeat(len(photos), 1)  # (B,A)
     adam = torch.optim.Adam([codes.requires_grad_()])
     img = photos.repeat_interleave(n)  # (Bn,)
-    size = torch.stack([scene.wh[img, 0] // 2, scene.wh[img, 1]], 1)  # (Bn,2) of the left halves
+    size = torch.stack([scene.wh[img, 0] // 2, scene.wh[img, 1]], 1)  # (Bn,2) of left halves [D12]
     model.requires_grad_(False)
     for step in tell(range(steps if codes.numel() else 0), "fitting the light of held-out photos"):
         adam.param_groups[0]["lr"] = 0.1 * 0.1 ** (step / steps)
@@ -1393,6 +1394,7 @@ def main(argv: list[str] | None = None) -> None:
     if device.type == "cuda":
         torch.cuda.set_device(device)
     if RANKS > 1:
+        need("MASTER_ADDR" in os.environ, "start processes by torchrun, or unset WORLD_SIZE")
         dist.init_process_group("cpu:gloo,cuda:nccl" if device.type == "cuda" else "gloo",
                                 timeout=datetime.timedelta(days=1))  # the first scores alone
         sys.stdout = open(os.devnull, "w") if RANK else sys.stdout

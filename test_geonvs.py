@@ -1221,6 +1221,7 @@ def test_lipschitz_mlp_is_an_mlp_whose_long_rows_are_cut_to_the_bound_that_it_ke
     mlp.c.data -= tight
     bounds, y, cut = [math.log1p(math.exp(c)) for c in mlp.c.tolist()], x, []
     close(mlp.bounds(), bounds, atol=2e-6)
+    assert [m.weight.shape for m in mlp.layers] == [(20, 6), (20, 20), (3, 20)]
     for i, layer in enumerate(mlp.layers):
         length = layer.weight.detach().abs().sum(1, keepdim=True)
         cut.append(length > bounds[i] * (1 + 1e-5))
@@ -2069,6 +2070,7 @@ def test_bad_checkpoints_are_refused_in_one_sentence_and_do_no_harm(six, scene, 
     odd = [None, -1, "x", [], {"a": 1}, torch.full((5,), 2 ** 62), Path]
     bad = [good | {key: value} for key in ("config", "model", "octrees", "optimizer", "state") for value in odd]
     bad += [good | dict(config=good["config"] | {key: "x"}) for key in ("rays", "lam_gpl", "flux")]
+    bad += [good | dict(state=good["state"] | {key: x}) for key in ("step", "refined", "seconds", "dropped") for x in odd]
     bad += [*odd, good | dict(run=Path), b"cos\nmkdir\n(S'%s'\ntR." % bytes(tmp_path / "harm")]
     assert all(map(refused, bad)) and not (tmp_path / "harm").exists() and not refused(data)
 
@@ -2336,9 +2338,9 @@ def test_one_command_trains_scores_and_writes_everything_and_others_go_on_and_fi
     ("--stepz=3", "--stepz"), ("--sam=3", "--sam"), ("--scene=brandenbrug", "brandenburg"), ("--scene=sacre", "sacre"),
     ("--data=nowhere", "nowhere"), ("--device=cuda", "cpu"), ("--device=meta", "meta"), ("--normals=none", "analytic"),
     ("--steps=many", "many"), ("--steps=0", "steps"), ("--lam_gpl=-1", "lam_gpl"), ("--lr_grid=nan", "lr_grid"),
-    ("--lr_grid=inf", "lr_grid"), ("--samples=1", "samples"), ("--bg_samples=1", "bg"), ("--rays=1 --photos=1", "rays"),
+    ("--lr_grid=inf", "lr_grid"), ("--samples=2", "samples"), ("--bg_samples=1", "bg"), ("--rays=1 --photos=1", "rays"),
     ("--rays=10 --photos=3", "photos"), ("--photos=0", "photos"), ("--hidden=0", "hidden"), ("--render", "render"),
-    ("--seed=" + "9" * 30, "seed"), ("--resume", "--resume"), ("--levels=9", "levels")])
+    ("--rays=2147483648", "rays"), ("--seed=" + "9" * 30, "seed"), ("--resume", "--resume"), ("--levels=9", "levels")])
 def test_a_mistake_ends_with_code_2_and_one_line_that_helps_and_no_folder(command, flags, word):
     assert word in command(*FLAGS, *flags.split()) and not Path("runs").exists()
 
@@ -2360,6 +2362,8 @@ def test_problems_end_with_code_2_and_one_line_and_a_full_disk_leaves_whole_file
         assert word in command(*FLAGS)
     with pytest.raises(NotImplementedError):  # a fault of ours, or of a driver, keeps its traceback
         g.run_command_line(lambda: next((_ for _ in ()).throw(NotImplementedError("CUDA error"))))
+    monkeypatch.setattr(g, "RANKS", 2)
+    assert "torchrun" in command(*FLAGS)
 
 
 def test_settings_come_from_defaults_then_the_scene_then_flags_and_devices_are_there(monkeypatch):
