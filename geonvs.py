@@ -221,8 +221,7 @@ class Interpolate(torch.autograd.Function):
     @staticmethod
     def backward(ctx, grad):  # (P,J,C)
         features, corner, w = ctx.saved_tensors
-        by_corner = w.transpose(1, 2)  # (P,8,J)
-        spread = by_corner * grad if w.shape[1] == 1 else torch.bmm(by_corner, grad)  # (P,8,C)
+        spread = torch.einsum("pjk,pjc->pkc", w, grad)  # (P,8,C)
         out = torch.zeros_like(features)  # (V,C)
         out.index_add_(0, corner.flatten().long(), spread.flatten(0, 1))  # a CPU adds slowly by int
         out[:PINNED] = 0  # hanging corners learn nothing
