@@ -575,7 +575,6 @@ def test_a_scene_file_never_runs_code(tmp_path, stored):
 def test_failed_write_leaves_the_old_file_and_nothing_else(tmp_path, error):
     path = tmp_path / "sub" / "sub" / "scene.npz"
     data_prep.atomic_write(path, lambda part: part.write_text("old"))
-
     def write(part):
         assert part.suffix == ".npz" and part.parent == path.parent and part.write_text("half")
         raise error
@@ -1474,7 +1473,8 @@ def test_doubling_the_sdf_and_halving_zeta_changes_nothing_but_the_eikonal_error
 
 def test_colour_and_eikonal_error_teach_every_part_and_nothing_else_carries_a_gradient(warm, scene):
     model, (rays, _) = copy.deepcopy(warm), batch(scene)
-    out = model.render(rays, model.appearance(rays.img))
+    out, jitter = model.render(rays, code := model.appearance(rays.img)), torch.full((64, model.cfg.samples + model.cfg.bg_samples), 0.5)
+    assert torch.equal(out["rgb"], g.render_rays(model, rays, code, jitter)["rgb"])  # pictures have samples mid-way
     assert {k for k, v in out.items() if v.requires_grad} == {"rgb", "eikonal"} and len(out) == 7
     (out["rgb"].sum() + out["eikonal"].sum()).backward()
     silent = {n for n, p in model.named_parameters() if p.grad is None or not (p.grad != 0).any()}
