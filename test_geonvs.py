@@ -1745,8 +1745,8 @@ def test_automatic_parts_follow_the_facts_of_the_scene_and_settings_overrule_the
         assert (model.codes().shape == (10, 4), model.background is not None, model.codes().requires_grad) == (has,) * 3
         assert (model.render(rays, model.codes()[rays.img])["rgb"] == model.bg_color).all() == (not has)
     close(new_model(plain).bg_color, [0.2, 0.4, 0.6])
-    octree = (model := new_model(mixed, levels=5)).sdf.octree
-    assert octree.levels == 5 and octree.active == 3 and model.eps == octree.cell(2) / 2  # of the finest cell there is
+    octree, far = (model := new_model(mixed, levels=5)).sdf.octree, scene.points[scene.points.norm(dim=1) > 1]
+    assert (fill(model.background.octree).locate(g.contract(far))[0] >= 8).all() and octree.levels == 5 and octree.active == 3 and model.eps == octree.cell(2) / 2  # of the finest cell there is
 
 
 @pytest.mark.parametrize("grid", ["octree", "uniform"])
