@@ -1670,11 +1670,11 @@ def test_losses_are_finite_with_any_setting_mask_sdf_and_sharpness_and_beside_th
     model.sdf.lin2.weight.data.zero_()
     share = torch.lt(*g.sphere_interval(rays)).float().mean().item()  # of rays that meet it
     for value, zeta in ((-1e4, 1e-2), (-1e4, 1e5), (-1e-4, 1e5), (0.0, 20.0), (0.03, 20.0), (1e4, 1e5)):
-        model.sdf.lin2.bias.data.fill_(value)  # the same s everywhere
-        model.deviation = g.Deviation(zeta)
-        _, raw = model.losses(rays, pick, 1, generator())
-        assert finite(model, rays, pick) and raw["eik"].item() == pytest.approx(share, abs=1e-7 + 1e-4 * abs(value))
-        close([raw[k].item() for k in ("curv", "off", "sfm")], [0, math.exp(-50 * abs(value)), abs(value) * min(max(zeta, 15 + 1 / 20), 40)])
+        _, model.deviation = model.sdf.lin2.bias.data.fill_(value), g.Deviation(zeta)  # the same s everywhere
+        (_, raw), zeta = model.losses(rays, pick, 1, generator()), min(max(zeta, 15 + 1 / 20), 32 * model.cfg.samples)
+        assert finite(model, rays, pick) and [v.item() for v in (raw["eik"], model.deviation())] == [
+            pytest.approx(share, abs=1e-7 + 1e-4 * abs(value)), pytest.approx(zeta, rel=1e-4)]
+        close([raw[k].item() for k in ("curv", "off", "sfm")], [0, math.exp(-50 * abs(value)), abs(value) * min(zeta, 40)])
 
 
 def test_only_lessons_teach_the_mask_and_every_eighth_step_the_cache(warm, scene):
@@ -1746,7 +1746,7 @@ def test_automatic_parts_follow_the_facts_of_the_scene_and_settings_overrule_the
         assert (model.render(rays, model.codes()[rays.img])["rgb"] == model.bg_color).all() == (not has)
     close(new_model(plain).bg_color, [0.2, 0.4, 0.6])
     octree, far = (model := new_model(mixed, levels=5)).sdf.octree, scene.points[scene.points.norm(dim=1) > 1]
-    assert (fill(model.background.octree).locate(g.contract(far))[0] >= 8).all() and octree.levels == 5 and octree.active == 3 and model.eps == octree.cell(2) / 2  # of the finest cell there is
+    assert (fill(model.background.octree).locate(g.contract(far))[0] >= 8).all() and octree.levels == 5 and octree.active == 3 and model.eps == octree.cell(2) / 2
 
 
 @pytest.mark.parametrize("grid", ["octree", "uniform"])
@@ -2257,7 +2257,7 @@ def test_mesh_of_the_warm_up_sphere_is_that_sphere_closed_looking_outwards_and_r
         empty.distance = lambda x: x[:, axis] - 0.01
         empty.cache.refresh(empty.distance)
         x = (g.extract_mesh(empty, 40)[0] - scene.raw["center"]) / scene.raw["scale"]
-        assert np.abs(x[:, axis] - 0.01).max() < 1e-3 and 0.9 < np.linalg.norm(x, axis=1).max() < 1
+        assert np.abs(x[:, axis] - 0.01).max() < 1e-3 and 0.9 < np.linalg.norm(x, axis=1).max() < 1 - (4 - 12 ** 0.5) / 40
         assert np.ptp(x[g.extract_mesh(empty, 40)[1]], axis=1).max() < 0.051  # no triangle beyond a cell
 
 
