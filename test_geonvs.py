@@ -762,7 +762,7 @@ def test_command_line_makes_a_toy_and_reads_a_folder_or_ends_in_one_sentence(des
 
 
 @pytest.mark.parametrize("argv", """toy --sizee 9, toy --siz 9, toy --size x,, nowhere, brandenburg, x --download,
-    toy --occluders 2, place --downscale 0, place --downscale 30, toy --pose_noise nan, toy --pose_noise inf,
+    toy --occluders 2, place --downscale 0, place --downscale 16, toy --pose_noise nan, toy --pose_noise inf,
     toy --downscale 4, toy --split x.tsv, place --split x.tsv, toy --exposure -1, toy --exposure 2.1, toy --seed -1,
     place --size 9, toy --size 15, toy --photos 3, toy --test -1, toy --pose_noise -1, toy --landmark -1""".split(","))
 def test_misspelt_commands_exit_with_2(desk, folder, argv):
@@ -1754,7 +1754,7 @@ def test_automatic_parts_follow_the_facts_of_the_scene_and_settings_overrule_the
 def test_the_poorest_scenes_train(scene, grid):
     none = torch.zeros(0, dtype=torch.long)  # no photo shows a point
     for poor, changes in ((scene._replace(points=scene.points[:1], track_uv=scene.track_uv[:0], track_photo=none), {}),
-                          (scene._replace(rgb=0 * scene.rgb, thumbs=0 * scene.thumbs), {}), (scene, dict(levels=1))):
+                          (scene._replace(rgb=0 * scene.rgb, thumbs=0 * scene.thumbs), {}), (scene, dict(levels=1, samples=3, bg_samples=2))):
         model = new_model(poor, grid=grid, **changes)
         assert finite(model, *batch(poor)) and finite(model, *batch(poor, 2, 1))  # as few rays as --rays allows
 
