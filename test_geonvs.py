@@ -97,7 +97,7 @@ def test_scene_dictionary_keeps_its_contract(tmp_path):
     assert info(other).items() >= dict(TINY_TOY, kind="toy", scene="toy", downscale=1, landmark=2).items()
     assert np.array_equal(np.diff(s["start"]), s["wh"].prod(1)) and s["is_test"].sum() == 2 and s["wh"].max() == 32
     r, ordered = s["c2w"][:, :, :3], (np.diff(s["track_photo"]) >= 0).all()
-    assert (np.linalg.det(r) > 0).all() and (r[:, 2, 1] < -.5).all() and ordered   # y is down
+    assert np.allclose(r @ r.transpose(0, 2, 1), np.eye(3), atol=1e-12) and (np.linalg.det(r) > 0).all() and (r[:, 2, 1] < -.5).all() and ordered   # y is down
 
 
 @pytest.mark.parametrize("number", [0, 1, 2, 10])
@@ -1067,6 +1067,8 @@ def test_seeding_splits_dense_levels_then_the_neighbourhood_of_points():
     assert counts(octree) == [512, 4096, 8 * len(want)]
     assert (octree.corner[octree.locate(points)[0]] >= g.PINNED).all()  # no corner beside a point hangs
     assert octree.features[g.PINNED:].square().mean().sqrt().item() == pytest.approx(0.01, rel=0.1)
+    node = octree.locate(torch.tensor([[-9, 1.6, 9]]))[0][0]
+    assert octree.cells[node[:2] - 8].tolist() == [[0, 0, 7, 7], [1, 0, 15, 15]] and node[2] < 8  # no cell there
     g.seed_octree(deep := g.Octree(1.6, 5, 1, root=8), points, 1, 3)  # down to the points, and only there
     assert (deep.corner[deep.locate(points)[0]] >= g.PINNED).all() and counts(deep)[:3] == counts(octree)
     assert 7 * 27 < counts(deep)[4] <= 8 * 27 * 7 and counts(deep)[3] <= 8 * 27 * 7
