@@ -534,7 +534,7 @@ class Background(nn.Module):
     def __init__(self, points: Tensor, hidden: int, per_ray: int):
         super().__init__()
         self.octree = Octree(2.0, levels=5, device=points.device)
-        seed_octree(self.octree, contract(points), 2, 2)  # two levels only near SfM points (K,3)
+        seed_octree(self.octree, contract(points), 1, 3)  # three levels only near SfM points (K,3)
         inputs = 3 + self.octree.features.shape[1] * self.octree.levels
         self.density, self.color = (
             nn.Sequential(nn.Linear(a, hidden), nn.ReLU(), nn.Linear(hidden, b))

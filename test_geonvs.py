@@ -1409,7 +1409,7 @@ def test_contract_is_identity_inside_below_two_outside_monotone_and_finite_with_
 
 def test_background_equals_naive_loops_over_its_sections_before_and_beyond_the_sphere():
     bg, n, want = g.Background(points := random(9, 3, low=1, high=3, dtype=torch.float32), 16, 12), 4, []
-    assert (fill(bg.octree).locate(g.contract(points))[0] >= 8).sum() == 9 * 5 and max(counts(bg.octree)[3:]) <= 9 * 27 * 8 < 64 ** 3 == counts(bg.octree)[2]
+    assert (fill(bg.octree).locate(g.contract(points))[0] >= 8).sum() == 9 * 5 and max(counts(bg.octree)[2:]) <= 9 * 27 * 8 < 32 ** 3 == counts(bg.octree)[1]
     rays = sphere_rays([(0.3, 0.2, -3), (0, 2, 0)], [(0, 0.1, 1), (1, 0, 0.3)])
     t0, t1, jitter = torch.tensor([2.0, 0.1]), torch.tensor([3.0, 0.5]), random(2, n + 2, seed=4, dtype=torch.float32)
     per_ray, jitter[1, -1] = random(2, 12, seed=5, dtype=torch.float32), 1.0  # its last is at infinity
