@@ -1,8 +1,8 @@
 """Geo-NVS-w: a signed distance field, fed by tourist photos, becomes a picture from a new view.
 
 A minimal single-file reference implementation of "Geo-NVS-w: Geometry-Aware Novel View Synthesis
-In-the-Wild with an SDF Renderer" (Tsalakopoulos et al., ICCV 2025 workshops). Sections 2-7 follow
-one ray from the pixel to the loss; then comes the training loop around it.
+In-the-Wild with an SDF Renderer" (Tsalakopoulos et al., ICCV 2025 workshops). Sections 2 to 7
+follow one ray from its pixel to the loss; the training loop comes after them.
 
     python geonvs.py                       toy scene: made, trained, scored (minutes, 2 CPU cores)
     python geonvs.py --scene brandenburg   a Phototourism scene (one GPU); also sacre, trevi, taj
@@ -16,32 +16,41 @@ Conventions
   rays      r(t) = o + t d with |d| = 1, so t is a distance along the ray and not a z-depth
   sdf       positive outside; the normal is the unit gradient; colours are sRGB in [0, 1]
   mask      M = 1 means transient (person, car), M = 0 means scene
-  shapes    R rays, S samples per ray, P points, N cells, pixels or sections, L octree levels, C
-            channels per level, V rows of features, H hidden width, G what colour is read from, A
-            appearance dims, B photos of all I, K SfM points, T sightings of them, m side of a mask
+  shapes    R rays, S sections of a ray (S + 1 samples), P points, N cells, L octree levels, C
+            channels per level, V rows of features, H hidden width, G what colour is read from,
+            A appearance dims, B photos of all I, K SfM points, T sightings of them
 
 Where the printed paper is departed from, the line carries its tag:
-  [D1]  alpha is divided by sigmoid(zeta s_prev), never negative (printed: a wall is 63 % opaque)
-  [D2]  the slope correction sits inside zeta, with opposite signs for the two ends of a section
-  [D3]  Phi: E_grad weighted by w, |lap| eps opacity, sigmoid set by quantiles, detached, x opacity
-  [D4]  the curvature loss is |lap| eps opacity: |lap| of a trilinear field grows as eps shrinks
+  [D1]  alpha is divided by sigmoid(zeta s_i) and never negative (printed: a wall is 63 % opaque)
+  [D2]  no beta in alpha: s is evaluated at both ends of a section, so no slope has to be guessed
+  [D3]  Phi: E_grad and |lap| eps where the ray ends, a sigmoid set by quantiles of rays on the
+        foreground, times opacity, without gradient
+  [D4]  the curvature loss is |lap| eps opacity, since |lap| of a trilinear field grows as eps
+        shrinks; its weight is 0.01 (printed: lambda_curv = 2 stands in Eq. 4 and in Eq. 5)
   [D5]  the Lipschitz term is a sum of logs, not a product that can drown the colour at first
   [D6]  a small CGNet on small square photos: one plain block a stage, GroupNorm, ReLU, finer head
-  [D7]  M, not M^2, as errors are L1, times lam_mask + lam_gpl Phi + what most SfM pixels err by
+  [D7]  M is taught as a classification: transient where a ray's error exceeds its price, which
+        is what SfM pixels err by, plus lam_mask, plus lam_gpl Phi; no term for bimodality
   [D8]  the background also fills what lies before the sphere; its last section is opaque
-  [D9]  all is float32: mixed precision, as the paper has it, makes noise of distances and normals
+  [D9]  mixed precision for the colour and background networks alone: distances stay float32
   [D10] SfM points place the sphere, seed the octree, teach M = 0 and pull s(p) to zero, but less
         while zeta is below 40: a strong pull would leave the surface fog
   [D11] samples are drawn from a cached SDF volume; no second network pass along the ray
   [D12] test photos: appearance fitted on the left half, scored on the right half
-  [D13] exact normals by trilinear weights (--normals fd: as printed); curvature where a ray ends
-  [D14] the mask learns every few steps, by a logistic surrogate, from averaged errors of photos
-  [D15] zeta stays above a rising floor, so that no surface stays fog, and below a fixed bound
-  [D16] cells split where colours err and merge far from surfaces; a scene that needs no codes, no
+  [D13] derivatives by four taps around the ray's end and around one random sample of it
+  [D14] zeta stays above a rising floor, so that no surface stays fog, and below a fixed bound
+  [D15] cells split where colours err and merge far from surfaces; a scene that needs no codes, no
         mask or no background field is modelled without
 """
-import argparse, datetime, functools, gc, io, json, math, os, re
-import resource, shutil, subprocess, sys, time
+import argparse
+import io
+import json
+import math
+import os
+import resource
+import subprocess
+import sys
+import time
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import NamedTuple
@@ -56,10 +65,9 @@ from skimage.metrics import structural_similarity
 from torch import Tensor, nn
 
 import data_prep
-from data_prep import UserError, atomic_write, need, tell
+from data_prep import UserError, atomic_write, check, progress
 
-torch.set_float32_matmul_precision("highest")  # [D9] no TF32, which some containers switch on,
-torch.backends.cudnn.allow_tf32 = False  # and convolutions have by default
+torch.set_float32_matmul_precision("highest")  # [D9] no TF32, which some containers switch on
 
 
 # ---- 1 Config: every field is a flag -------------------------------------------------------------
@@ -81,42 +89,39 @@ class Config:
     downscale: int = opt(2, "integer factor by which photos are made smaller (benchmarks use 2)")
     rays: int = opt(512, "rays per step, of all processes together")
     photos: int = opt(8, "photos per step, of each process; the mask network sees them whole")
-    samples: int = opt(16, "foreground samples per ray")
-    bg_samples: int = opt(24, "background samples per ray, a third of them before the sphere")
+    samples: int = opt(15, "sections of a ray in the foreground")
+    bg_samples: int = opt(24, "background samples per ray, a sixth of them before the sphere")
     levels: int = opt(0, "octree levels, 0: from the pixel footprint at the surface", *range(9))
-    grid: str = opt("octree", "uniform: the same finest cell everywhere", "octree", "uniform")
-    max_mb: float = opt(1000.0, "limit of the foreground's octree with Adam's moments, MiB")
     hidden: int = opt(64, "width of the MLPs")
     appearance_dim: int = opt(16, "length of a photo's appearance code")
     appearance: str = opt("auto", "codes; auto: on if exposures differ", "auto", "on", "off")
-    mask: str = opt("auto", "auto: if M over 0.01; printed: M^2", "auto", "on", "off", "printed")
+    mask: str = opt("auto", "auto: off if it marks under 1 %", "auto", "on", "off")
     background: str = opt("auto", "field; auto: off if it is one colour", "auto", "on", "off")
-    normals: str = opt("analytic", "derivatives of the SDF [D13]", "analytic", "fd")
-    sampling: str = opt("cached", "how samples are placed [D11]", "cached", "uniform")
-    alpha: str = opt("neus", "opacity of a section [D1] [D2]", "neus", "printed")
-    gpl: str = opt("calibrated", "sigmoid of Phi [D3]; literal: 0 and 1", "calibrated", "literal")
     lam_eik: float = opt(0.04, "weight of the eikonal loss (Permuto-SDF)")
-    lam_curv: float = opt(3e-3, "weight of the curvature loss, on |lap| eps [D4]")
+    lam_curv: float = opt(0.01, "weight of the curvature loss, on |lap| eps [D4]")
     lam_gpl: float = opt(0.05, "weight of the geometry-preservation loss (paper)")
     lam_lps: float = opt(1e-5, "weight of the Lipschitz loss, log form [D5]")
     lam_off: float = opt(1e-3, "weight of the off-surface loss")
     lam_sfm: float = opt(7.5e-3, "weight of min(zeta, 40) |s(p)| at SfM points [D10]")
-    lam_mask: float = opt(0.04, "weight of mean M: the excess error that masks a pixel [D7]")
+    lam_mask: float = opt(0.04, "error above that of SfM pixels that masks a ray [D7]")
     lr_grid: float = opt(1e-2, "learning rate of octree features and appearance codes")
     lr_net: float = opt(2e-3, "learning rate of networks")
-    lr_zeta: float = opt(1e-3, "learning rate of the deviation network")
 
-    def __post_init__(self):  # refuses what cannot work, before anything is written
-        least = dict(samples=3, bg_samples=2, rays=2, photos=1, steps=1, downscale=1, hidden=1)
-        for f in fields(self):
-            value, low = getattr(self, f.name), least.get(f.name, 0)
-            is_right = isinstance(value, str) if f.type is str else low <= value < 2 ** 31
-            need(is_right and value in (f.metadata["choices"] or [value]),
-                 f"--{f.name} {value} makes no sense: use a number from {low}, or see --help")
-        need(self.rays % self.photos == 0, "--rays must be a multiple of --photos")
+    def __post_init__(self):
+        """Refuses what cannot work, before anything is written."""
+        at_least = dict(samples=3, bg_samples=6, rays=2, photos=1, steps=1, downscale=1, hidden=1)
+        for setting in fields(self):
+            value = getattr(self, setting.name)
+            choices = setting.metadata["choices"]
+            least = at_least.get(setting.name, 0)
+            flag = f"--{setting.name} {value} makes no sense"
+            check(choices is None or value in choices, f"{flag}: choose one of {choices}")
+            if setting.type is not str:
+                check(least <= value < 2**31, f"{flag}: use a number from {least}")
+        check(self.rays % self.photos == 0, "--rays must be a multiple of --photos")
 
     @property
-    def source(self) -> str:
+    def source(self):
         """What data_prep.open_scene takes: a scene's name, or a folder, never mistaken for one."""
         return str(Path(self.data).resolve()) if self.data else self.scene
 
@@ -143,488 +148,564 @@ class Scene(NamedTuple):
     raw: dict  # the file in numpy: names, statistics, center, scale, ground truth of the toy
     info: dict
 
-    def photos(self, is_test: bool) -> Tensor:
+    def photos(self, is_test):
         """Numbers (B,) of the held-out photos, or of those to train on."""
         return torch.nonzero(self.is_test == is_test)[:, 0]
 
 
-def load_scene(raw: dict, device="cpu") -> Scene:
+DTYPES = dict(i=torch.long, f=torch.float32, u=torch.uint8, b=torch.bool)  # by numpy's kinds
+
+
+def load_scene(raw, device="cpu"):
     """Scene from the dictionary of a scene file (data_prep.open_scene, make_toy or prepare)."""
-    photos = [raw["rgb"][a:b].reshape(h, w, 3)
-              for a, b, (w, h) in zip(raw["start"], raw["start"][1:], raw["wh"])]
-    side = int(np.clip(np.median(raw["wh"].max(1)) / 2, 96, 256))  # what the mask network sees [D6]
-    thumbs = [cv2.resize(p, (side, side), interpolation=cv2.INTER_AREA) for p in photos]
-    thumbs = torch.as_tensor(np.stack(thumbs)).permute(0, 3, 1, 2).contiguous().to(device)
-    kinds = dict(i=torch.long, f=torch.float32)  # uint8 and bool stay what they are
-    arrays = {k: torch.as_tensor(raw[k], dtype=kinds.get(raw[k].dtype.kind), device=device)
-              for k in Scene._fields[:-3]}
-    return Scene(**arrays, thumbs=thumbs, raw=raw, info=json.loads(str(raw["info"])))
+    side = int(np.clip(np.median(raw["wh"].max(1)) / 2, 96, 256))  # px [D6]
+    thumbs = []
+    for first, (w, h) in zip(raw["start"], raw["wh"]):
+        photo = raw["rgb"][first:first + w * h].reshape(h, w, 3)
+        thumbs.append(cv2.resize(photo, (side, side), interpolation=cv2.INTER_AREA))
+    arrays = raw | dict(thumbs=np.stack(thumbs).transpose(0, 3, 1, 2))
+    tensors = []
+    for key in Scene._fields[:11]:
+        dtype = DTYPES[arrays[key].dtype.kind]
+        tensors.append(torch.as_tensor(arrays[key], dtype=dtype, device=device))
+    return Scene(*tensors, raw, json.loads(str(raw["info"])))
 
 
 class Rays(NamedTuple):
     """A batch of rays; every field is indexed by the ray."""
     o: Tensor  # (R,3) origin
     d: Tensor  # (R,3) unit direction
-    near: Tensor  # (R,)
+    near: Tensor  # (R,1)
     img: Tensor  # (R,) photo index
     uv: Tensor  # (R,2) pixel position over photo size, 0..1
     rgb: Tensor  # (R,3) the photo's colour
 
-    def at(self, t: Tensor) -> Tensor:
+    def at(self, t):
         """Points (R,S,3) at distances t (R,S)."""
         return torch.addcmul(self.o[:, None], t[:, :, None], self.d[:, None])
 
 
-def make_rays(scene: Scene, img: Tensor, pixel: Tensor) -> Rays:
-    """Rays through pixels. img, pixel: (R,) photo and row-major pixel number within it."""
-    wh, K, c2w = scene.wh[img], scene.K[img], scene.c2w[img]  # (R,2), (R,4), (R,3,4)
-    uv = torch.stack([pixel % wh[:, 0], pixel // wh[:, 0]], 1) + 0.5  # (R,2) px
-    d = F.pad((uv - K[:, 2:]) / K[:, :2], (0, 1), value=1.0)  # (R,3) in camera axes
-    d = (c2w[:, :, :3] @ F.normalize(d, dim=1)[:, :, None])[:, :, 0]  # (R,3)
-    rgb = scene.rgb[scene.start[img] + pixel].float() / 255  # (R,3)
-    return Rays(c2w[:, :, 3], d, scene.near[img], img, uv / wh, rgb)
+def make_rays(scene, img, pixel):
+    """Rays through pixels. img, pixel: (R,) photo, and row-major number in it."""
+    wh = scene.wh[img]  # (R,2)
+    K = scene.K[img]  # (R,4)
+    c2w = scene.c2w[img]  # (R,3,4)
+    col = pixel % wh[:, 0]
+    row = pixel // wh[:, 0]
+    xy = torch.stack([col, row], 1) + 0.5  # (R,2) px
+    d = F.pad((xy - K[:, 2:]) / K[:, :2], (0, 1), value=1.0)  # (R,3) in camera axes
+    d = torch.einsum("rij,rj->ri", c2w[:, :, :3], F.normalize(d))  # in the world's
+    rgb = scene.rgb[scene.start[img] + pixel] / 255
+    return Rays(c2w[:, :, 3], d, scene.near[img, None], img, xy / wh, rgb)
 
 
-def sphere_interval(rays: Rays) -> tuple[Tensor, Tensor]:
-    """Distances (R,), (R,) at which rays enter and leave the unit sphere. A ray that misses it, or
-    has it behind, gets an empty interval: at its closest approach, or at near."""
-    closest = -(rays.o * rays.d).sum(1)  # (R,)
-    away = rays.at(closest[:, None])[:, 0]  # (R,3) the point nearest to the sphere's centre
-    half = (1 - (away ** 2).sum(1)).clamp(min=0).sqrt()  # (R,)
-    t0 = torch.maximum(closest - half, rays.near)  # (R,)
-    return t0, torch.maximum(closest + half, t0)
+def uniform(gen, *shape):
+    """Random numbers in [0, 1) on the generator's device."""
+    return torch.rand(shape, generator=gen, device=gen.device)
+
+
+def random_rays(scene, img, gen, part=1.0):
+    """Rays through random pixels of the photos img (R,), of the left `part` of each."""
+    w, h = scene.wh[img].unbind(1)
+    u, v = uniform(gen, 2, len(img))
+    col = (u * (part * w).long()).long()
+    row = (v * h).long()
+    return make_rays(scene, img, row * w + col)
+
+
+def sphere_interval(rays):
+    """Distances (R,1), (R,1) at which rays enter and leave the unit sphere. A ray that misses it,
+    or has it behind, gets an empty interval: at its closest approach, or at near."""
+    closest = -(rays.o * rays.d).sum(1, keepdim=True)  # (R,1)
+    distance = rays.at(closest).norm(dim=2)  # (R,1) from the sphere's centre
+    half = (1 - distance**2).clamp(min=0).sqrt()
+    t0 = torch.maximum(closest - half, rays.near)
+    t1 = torch.maximum(closest + half, t0)
+    return t0, t1
 
 
 # ---- 3 Octree: features on the corners of cells --------------------------------------------------
 
-# A corner's weight is a product over the axes: 1 - f at the near end, f at the far end, for f in
-# 0..1. Columns: the 8 corners' weights, then their derivatives, where an axis has its slope, -1, 1.
-FAR = torch.cartesian_prod(*[torch.arange(2.0)] * 3).T.repeat(1, 4)  # (3,32) 1 at the far end
-IS_SLOPE = F.pad(torch.eye(3), (1, 0)).repeat_interleave(8, 1) > 0  # (3,32)
-TRILINEAR = torch.stack([torch.where(IS_SLOPE, 2 * FAR - 1, 1 - FAR),  # (2,3,32) constant and
-                         torch.where(IS_SLOPE, 0, 2 * FAR - 1)])  # factor of f
-PINNED = 64  # rows that stay zero, for hanging corners: on one row a GPU would queue their writes
-CHUNK = 4096  # points or rays evaluated at once without gradient
-resident = functools.cache(Tensor.to)  # a constant on a device: one copy, as copies make a GPU wait
+CHUNK = 2**15  # points evaluated at once without gradient
+MAX_CELLS = 8_000_000  # of the foreground: about 1 GB with Adam's moments
 
 
-class Interpolate(torch.autograd.Function):
-    """out[p,j] = sum over the 8 corners k of w[p,j,k] features[corner[p,k]], for J sets of weights:
-    of the value, and of its derivatives along x, y, z. The hottest operation of a step."""
+def corner_weights(f):
+    """Trilinear weights (P,8) of a cell's corners at f (P,3), 0..1 within the cell."""
+    x, y, z = torch.stack([1 - f.T, f.T]).unbind(1)  # (2,P) of both ends of each axis
+    w = torch.einsum("ip,jp,kp->ijkp", x, y, z)  # (2,2,2,P)
+    return w.flatten(0, 2).T.contiguous()
+
+
+class WeightedSum(torch.autograd.Function):
+    """Row p of the result: the sum over 8 corners k of w[p,k] table[row[p,k]]. A step's hottest
+    operation; autograd's own backward takes several times as long."""
     @staticmethod
-    def forward(ctx, features, corner, w):  # (V,C), (P,8), (P,J,8) -> (P,J,C)
-        ctx.save_for_backward(features, corner, w)
-        at = corner[:, None].expand(w.shape).reshape(-1, 8)  # (PJ,8)
-        out = F.embedding_bag(at, features, per_sample_weights=w.reshape(-1, 8), mode="sum")
-        return out.reshape(*w.shape[:2], features.shape[1])
+    def forward(ctx, table, row, w):  # (V,C), (P,8), (P,8) -> (P,C)
+        ctx.save_for_backward(row, w)
+        ctx.shape = table.shape
+        return F.embedding_bag(row, table, per_sample_weights=w, mode="sum")
 
     @staticmethod
-    def backward(ctx, grad):  # (P,J,C)
-        features, corner, w = ctx.saved_tensors
-        spread = torch.einsum("pjk,pjc->pkc", w, grad)  # (P,8,C)
-        out = torch.zeros_like(features)  # (V,C)
-        out.index_add_(0, corner.flatten().long(), spread.flatten(0, 1))  # a CPU adds slowly by int
-        out[:PINNED] = 0  # hanging corners learn nothing
+    def backward(ctx, grad):  # (P,C)
+        row, w = ctx.saved_tensors
+        share = w[:, :, None] * grad[:, None]  # (P,8,C)
+        out = grad.new_zeros(ctx.shape)  # (V,C)
+        out.index_add_(0, row.flatten().long(), share.flatten(0, 1))
         return out, None, None
 
 
+def constant(*values):
+    """A tensor that moves along with its module, and is not saved."""
+    return nn.Buffer(torch.tensor(values), persistent=False)
+
+
+def grid_index(n, device):
+    """All index triples (n^3,3) of a cube of n^3 cells, the last index fastest."""
+    axis = torch.arange(n, device=device)
+    return torch.cartesian_prod(axis, axis, axis)
+
+
 class Octree(nn.Module):
-    """Feature grid over the cube [-half, half]^3 that is fine only where it has been split. Level 0
-    is a dense grid of root^3 cells; a node points to its first of eight children. Nodes 0-7, the
-    null block, stand in for children that do not exist. Features live on corners, shared by the
-    cells that meet there. A corner with a missing cell around it ("hanging") is pinned to zero: the
-    field is continuous across borders of refined regions. Levels that a place lacks are zeros."""
-    def __init__(self, half: float, levels: int, channels: int = 4, device="cpu", root: int = 16):
+    """Feature grid over the cube [-half, half]^3 that is fine only where it has been split. Level
+    0 is a dense grid of root^3 cells. Features live on corners, shared by the cells that meet
+    there. A corner that lacks one of its cells ("hanging") has the weight 0, so the field is
+    continuous across borders of refined regions; so has a level that a place lacks."""
+    def __init__(self, half, levels, channels=4, root=16):
         super().__init__()
-        self.half, self.levels, self.root = half, levels, root
-        self.n = (root << levels) + 1  # more than the finest level has corners a side
-        self.features = nn.Parameter(torch.zeros(PINNED, channels, device=device))  # (V,C)
-        self.row_key = torch.arange(-PINNED, 0, device=device)  # (V,) the corner that owns a row
-        constant = lambda value: nn.Buffer(value.to(device), persistent=False)
-        self.per_unit = constant(1 / self.cell(torch.arange(levels)))  # (L,)
-        self.middle = constant(half * self.per_unit[:, None])  # (L,1) of the cube, in cells
-        self.trilinear = constant(TRILINEAR)  # (2,3,32)
-        # a cell's number: row-major on level 0, then among 8 children by the last bits of i, j, k
-        steps = torch.tensor([[-1, root ** 2, root, 1], *[[1, 4, 2, 1]] * (levels - 1)]).int()
-        self.bits, self.stride = constant(steps[:, :1]), constant(steps[:, 1:])  # (L,1), (L,3)
-        self.build(self.row_key[:0])
+        self.half = half
+        self.levels = levels
+        self.root = root
+        self.features = nn.Parameter(torch.zeros(1, channels))  # (V,C)
+        self.corner_key = torch.tensor([-1])  # (V,) the corner that owns a row
+        self.row_stride = constant(root**2, root, 1)
+        self.octant_stride = constant(4, 2, 1)
+        self.resolution = constant(*[root * 2.0**level for level in range(levels)])  # (L,)
+        self.build(self.corner_key)
 
-    def cell(self, level):
+    def side(self, level):
         """Side of a cell, scene units. level: a number, or a tensor of them."""
-        return 2 * self.half / (self.root * 2.0 ** level)
+        return 2 * self.half / (self.root * 2.0**level)
 
-    def key(self, at: Tensor) -> Tensor:
-        """One number for a cell or corner (...,4) level, i, j, k; linear in them."""
-        return ((at[..., 0] * self.n + at[..., 1]) * self.n + at[..., 2]) * self.n + at[..., 3]
+    def key(self, at):
+        """One number for a cell or corner (...,4) level, i, j, k, each below 2^13."""
+        level, i, j, k = at.unbind(-1)
+        return (level << 39) + (i << 26) + (j << 13) + k
 
-    def build(self, split_keys: Tensor) -> Tensor:
-        """Makes nodes and corners from the keys of the cells that are split. New features are zero.
-        Returns the former row (V,) of every row, 0 (a pinned one) if new."""
-        octant = torch.cartesian_prod(*[torch.arange(2, device=split_keys.device)] * 3)  # (8,3)
-        ijk = torch.cartesian_prod(*[torch.arange(self.root, device=octant.device)] * 3)  # (N,3)
-        cells, cut = [], []
-        for level in range(self.levels):
-            cells.append(F.pad(ijk, (1, 0), value=level))  # (N,4)
-            cut.append(torch.isin(self.key(cells[-1]), split_keys) & (level + 1 < self.levels))
-            ijk = (2 * ijk[cut[-1]][:, None] + octant).reshape(-1, 3)  # (N,3) of the next level
-        self.cells, cut = torch.cat(cells), torch.cat(cut)  # (N,4), (N,) is it split
-        self.child = F.pad(torch.where(cut, 8 * cut.cumsum(0) + self.root ** 3, 0), (8, 0)).int()
-        self.active = int(self.cells[-1, 0]) + 1  # levels that have cells
-        key, n = self.key(self.cells), self.n  # (N,)
-        self.split_keys = key[cut]
-        keys, inverse, count = torch.unique(key[:, None] + self.key(F.pad(octant, (1, 0))),  # (N,8)
-                                            return_inverse=True, return_counts=True)
-        at = torch.stack([keys // n ** 2, keys // n, keys], 1) % n  # (Q,3) corners
-        last = self.root << (keys // n ** 3)[:, None]  # (Q,1) of their level, on the far faces
-        free = count == 2 ** ((at > 0) & (at < last)).sum(1)  # (Q,) all cells around it exist
-        row = torch.where(free, PINNED - 1 + free.cumsum(0), keys % PINNED)  # (Q,)
-        null = torch.arange(PINNED, device=row.device).reshape(8, 8)  # rows of the null block
-        self.corner = torch.cat([null, row[inverse]]).int()  # (8+N,8)
-        old_key, self.row_key = self.row_key, torch.cat([self.row_key[:PINNED], keys[free]])  # (V,)
-        old_row = torch.searchsorted(old_key, self.row_key).clamp(max=len(old_key) - 1)
-        old_row = torch.where(old_key[old_row] == self.row_key, old_row, 0)  # (V,)
-        self.features = nn.Parameter(self.features.detach()[old_row])  # (V,C)
-        return old_row
+    @property
+    def split_keys(self):
+        return self.key(self.cells[self.child > 0])
 
-    def split(self, cells: Tensor) -> None:
+    def split(self, cells):
         """Splits cells (...,4); the function stays, as new features are zero."""
         self.build(torch.cat([self.split_keys, self.key(cells).flatten()]))
 
-    def locate(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Nodes (P,L) that hold x (P,3), 8 + the row in cells, below 8 where a level has no cell;
-        and where in each, 0..1 (P,L,3). An x outside the cube is moved to its border."""
-        x = x.nan_to_num(0).clamp(-self.half, self.half * (1 - 1e-6))[:, None]  # (P,1,3)
-        middle, per_unit = self.middle[:self.active], self.per_unit[:self.active, None]  # (L,1)
-        at = torch.addcmul(middle, x, per_unit)  # (P,L,3) in cells
-        step = (at.int() & self.bits[:self.active]) * self.stride[:self.active]  # (P,L,3)
-        step = step.sum(2, dtype=torch.int32)  # (P,L)
-        nodes = [8 + step[:, 0]]  # (P,) root cell, then the child of the cell before
-        for level in range(1, self.active):
-            nodes.append(self.child.index_select(0, nodes[-1]) + step[:, level])  # (P,)
-        return torch.stack(nodes, 1), at.frac()
+    def build(self, split_keys):
+        """Makes cells and corners from the keys of the cells that are split. New features are
+        zero. Returns the former row (V,) of every row, -1 if new."""
+        octants = grid_index(2, split_keys.device)  # (8,3)
+        index = grid_index(self.root, split_keys.device)  # (N,3)
+        levels = []
+        splits = []
+        for level in range(self.levels):
+            cells = F.pad(index, (1, 0), value=level)  # (N,4)
+            is_split = torch.isin(self.key(cells), split_keys)  # (N,)
+            is_split &= level < self.levels - 1
+            levels.append(cells)
+            splits.append(is_split)
+            index = (2 * index[is_split][:, None] + octants).flatten(0, 1)  # of the next level
+        self.cells = torch.cat(levels)  # (N,4) level, i, j, k
+        self.finest = self.cells[-1, 0].item()  # level
+        is_split = torch.cat(splits)
+        first = self.root**3 + 8 * (is_split.cumsum(0) - 1)  # (N,) children follow each other
+        self.child = torch.where(is_split, first, 0).int()  # (N,) 0: none
+        self.ends = nn.Buffer(torch.zeros(len(first), 3, device=first.device))  # see record
 
-    def forward(self, x: Tensor, derivatives: bool = False) -> Tensor:
-        """Features (P,L,J,C) at x (P,3); J = 1, or 4: value, its change per cell along x, y, z."""
-        P, L, J = len(x), self.active, 4 if derivatives else 1
-        nodes, inside = self.locate(x)  # (P,L), (P,L,3)
-        axes = zip(*self.trilinear[:, :, :8 * J], inside.reshape(-1, 3, 1).unbind(1))
-        x, y, z = (torch.addcmul(start, f, rise) for start, rise, f in axes)  # (PL,8J)
-        w = (x * y * z).reshape(-1, J, 8)  # (PL,J,8)
-        corner = self.corner.index_select(0, nodes.flatten())  # (PL,8)
-        out = Interpolate.apply(self.features, corner, w).reshape(P, L, J, self.features.shape[1])
-        return F.pad(out, (0, 0, 0, 0, 0, self.levels - L)) if L < self.levels else out
+        corners = self.cells[:, None] + F.pad(octants, (1, 0))  # (N,8,4)
+        key = self.key(corners)  # (N,8)
+        _, number, cells_around = key.unique(return_inverse=True, return_counts=True)
+        last = self.root << self.cells[:, :1, None]  # (N,1,1) index on the cube's far faces
+        is_within = (corners[:, :, 1:] > 0) & (corners[:, :, 1:] < last)  # (N,8,3)
+        self.is_free = cells_around[number] == 2 ** is_within.sum(2)  # (N,8) not hanging
+        old_key = self.corner_key
+        self.corner_key = key[self.is_free].unique()  # (V,)
+        self.corner = nearest_row(self.corner_key, key).int()  # (N,8) any row, where hanging
+        old_row = nearest_row(old_key, self.corner_key)
+        old_row = torch.where(old_key[old_row] == self.corner_key, old_row, -1)
+        self.features = nn.Parameter(carry_rows(self.features.detach(), old_row))
+        return old_row
+
+    def locate(self, x):
+        """For x (P,3) and each level: the finest cell so far, a row of cells (P,L); whether the
+        level has a cell there (P,L); the place in it, 0..1 (P,L,3). An x outside the cube is
+        moved to its border."""
+        at = (0.5 + x * (0.5 / self.half)).clamp(0, 1 - 1e-6).nan_to_num(0)  # (P,3) over the cube
+        at = at[:, None] * self.resolution[:, None]  # (P,L,3) in cells
+        index = at.long()  # (P,L,3)
+        octant = ((index & 1) * self.octant_stride).sum(2)  # (P,L)
+        node = (index[:, 0] * self.row_stride).sum(1)  # (P,)
+        nodes = [node]
+        exists = [node >= 0]
+        for level in range(1, self.levels):
+            child = self.child.index_select(0, node)  # (P,)
+            exists.append(child > 0)
+            node = torch.where(exists[-1], child + octant[:, level], node)
+            nodes.append(node)
+        return torch.stack(nodes, 1), torch.stack(exists, 1), at.frac()
+
+    def forward(self, x):
+        """Features (P,LC) at x (P,3)."""
+        node, exists, place = self.locate(x)
+        node = node.flatten()  # (PL,)
+        w = corner_weights(place.flatten(0, 1))  # (PL,8)
+        w = w * self.is_free.index_select(0, node) * exists.reshape(-1, 1)
+        corner = self.corner.index_select(0, node)  # (PL,8)
+        out = WeightedSum.apply(self.features, corner, w)  # (PL,C)
+        return out.reshape(len(x), -1)
+
+    def record(self, x, error, pixel, weight):
+        """Adds to the cells where rays end, at x (P,3): error, size of a pixel and weight (P,)."""
+        node, _, _ = self.locate(x)
+        columns = torch.stack([error, pixel, torch.ones_like(error)], 1)  # (P,3)
+        self.ends.index_add_(0, node[:, -1], weight[:, None] * columns)
 
 
-def seed_octree(octree: Octree, points: Tensor, dense: int, near: int = 1) -> None:
+def nearest_row(sorted_keys, key):
+    """Rows of sorted_keys (V,) where key (...) is, or would be."""
+    return torch.searchsorted(sorted_keys, key).clamp(max=len(sorted_keys) - 1)
+
+
+def carry_rows(table, old_row):
+    """Rows old_row (V,) of a table (.,C), zeros where old_row is -1."""
+    return torch.where(old_row[:, None] >= 0, table[old_row], 0)
+
+
+def in_chunks(function, x):
+    """function(x) of points (P,3), a part at a time."""
+    return torch.cat([function(part) for part in x.split(CHUNK)])
+
+
+def seed_octree(octree, points, dense, near):
     """Splits the first `dense` levels everywhere, `near` more around points (P,3), neighbours too,
     so that no corner of a point's cell is hanging; then random features. [D10]"""
     for _ in range(dense):
         octree.split(octree.cells)
-    step = torch.cartesian_prod(*[torch.arange(-1, 2, device=points.device)] * 3)  # (27,3)
+    neighbours = F.pad(grid_index(3, points.device) - 1, (1, 0))  # (27,4)
     for _ in range(near):
-        home = octree.cells[octree.locate(points)[0][:, -1].unique() - 8]  # (N,4)
-        octree.split(home[:, None] + F.pad(step, (1, 0)))
-    octree.features.data[PINNED:].normal_(0, 0.01)
+        node, _, _ = octree.locate(points)
+        home = octree.cells[node[:, -1].unique()]  # (N,4)
+        octree.split(home[:, None] + neighbours)
+    nn.init.normal_(octree.features, std=0.01)
 
 
-SPLIT_RAYS = 6  # recent rays that end in a cell before it is split
-SPLIT_ERROR = 2.0  # their mean error over the lower quartile of all rays' that splits it
+ERROR_SHARE = 0.8  # of the error at the surface lies in the cells that are split
 HIDDEN = 6.0  # zeta |s| from where on the field is hardly seen: sigmoid(-6) = 0.0025
 
 
-def refined_keys(octree: Octree, sdf, hits: Tensor, zeta: float, max_mb: float) -> Tensor:
-    """Keys of the cells that should be split. sdf: (P,3) to (P,); hits (P,5): where recent rays
-    ended, their masked error, a pixel's size there; 2: no ray yet. A cell at the surface is split
-    if enough rays end in it, their error is high and its children are no finer than pixels; worst
-    first, as far as max_mb allows. It is merged if hardly anything near it is seen. [D16]"""
-    is_inside = hits[:, :3].norm(dim=1) < 1  # (P,) rays that miss the sphere split no cells
-    if not is_inside.any():
-        return octree.split_keys
-    errors, hits = hits[hits[:, 4] != 2, 3].sort()[0], hits[is_inside]  # (Q,) of all rays, (P,5)
-    cells = octree.cells[octree.cells[:, 0] < octree.levels - 1]  # (N,4) all but the finest
-    side, is_split = octree.cell(cells[:, 0]), octree.child[8:8 + len(cells)] > 0  # (N,)
-    centre = (cells[:, 1:] + 0.5) * side[:, None] - octree.half  # (N,3)
-    s = torch.cat([sdf(x) for x in centre.split(CHUNK)]).abs()  # (N,)
-    reach = (math.sqrt(3) / 2 + 1) * side  # (N,)
+@torch.no_grad()
+def refined_keys(octree, sdf, zeta):
+    """Keys of the cells that should be split. sdf: (P,3) to (P,). Of the cells at the surface whose
+    children are no finer than a pixel, the worst are split: those that hold most of the error
+    recorded there. A cell is merged if nothing near it is seen. [D15]"""
+    level = octree.cells[:, 0]  # (N,)
+    side = octree.side(level)
+    centre = (octree.cells[:, 1:] + 0.5) * side[:, None] - octree.half  # (N,3)
+    s = in_chunks(sdf, centre).abs()  # (N,)
+    reach = 1.87 * side  # half a cell's diagonal, and a cell
+    is_split = octree.child > 0
+    error, pixel, count = octree.ends.unbind(1)  # (N,) sums
+    is_open = (s < reach) & ~is_split & (level < octree.levels - 1)
+    is_coarse = pixel < count * side / 2
+    error = error * (is_open & is_coarse)
+    worst = error.argsort(descending=True)  # (N,)
+    before = error[worst].cumsum(0) - error[worst]  # (N,) what worse cells hold
+    wanted = int((before < ERROR_SHARE * error.sum()).sum())
+    room = max(0, MAX_CELLS - len(level)) // 8
     is_split &= s < reach + HIDDEN / zeta
-    nodes, bound = octree.locate(hits[:, :3])[0], SPLIT_ERROR * errors[len(errors) // 4]  # (P,L)
-    found = F.pad(hits[:, 3:], (0, 1), value=1.0).repeat_interleave(nodes.shape[1], 0)  # (PL,3)
-    found = hits.new_zeros(len(octree.child), 3).index_add_(0, nodes.flatten(), found)  # (8+N,3)
-    error, pixel, count = found[8:8 + len(cells)].unbind(1)  # (N,) sums
-    pays = (count >= SPLIT_RAYS) & (error > bound * count) & (pixel < count * side / 2)  # (N,)
-    pays &= (s < reach) & ~is_split
-    held = 76 + 16 * octree.features.shape[1]  # bytes: a node; a row, its gradient, Adam's moments
-    room = max(0, int(max_mb * 2 ** 20 / held) - len(octree.child)) // 8
-    worst = (error / count)[pays].argsort(descending=True)  # (Q,)
-    is_split[pays.nonzero()[worst[:room], 0]] = True
-    return octree.key(cells[is_split])
+    is_split[worst[:min(wanted, room)]] = True
+    return octree.key(octree.cells[is_split])
 
 
 # ---- 4 Fields: the networks on top of the octree -------------------------------------------------
 
 GEO = 15  # length of the geometry feature that the SDF network hands to the colour network
-BETA = 100.0  # sharpness of the SDF network's softplus: nearly a ReLU, but twice differentiable
+MIXED_ON = {"cuda"}  # devices whose colour and background networks run in bfloat16 [D9]
+
+
+def mixed_precision(network, x):
+    """network(x) in float32, computed in bfloat16 where that pays. [D9]"""
+    if x.device.type not in MIXED_ON:
+        return network(x)
+    with torch.autocast(x.device.type, torch.bfloat16):
+        return network(x).float()
+
+
+def mlp(inputs, hidden, outputs):
+    """A network with one hidden layer."""
+    return nn.Sequential(nn.Linear(inputs, hidden), nn.ReLU(), nn.Linear(hidden, outputs))
+
+
+def finite_differences(s, taps, eps):
+    """Gradient (P,3) and Laplacian (P,) of a field from its values s (P,5) at x + eps taps: x
+    itself, then the ends of a regular tetrahedron (Neuralangelo uses six ends). [D13]"""
+    grad = 3 / (4 * eps) * (s @ taps)  # (P,3) as the sum of k k^T over the ends is 4/3
+    lap = 6 / eps**2 * (s[:, 1:].mean(1) - s[:, 0])
+    return grad, lap
 
 
 class SDFField(nn.Module):
     """s(x) and what colour is read from: a geometry feature beside the octree's own features. One
     hidden layer over xyz and features; G = GEO + L C. In float32 [D9]."""
-    def __init__(self, octree: Octree, hidden: int):
+    def __init__(self, octree, hidden):
         super().__init__()
-        self.octree, self.features = octree, octree.features.shape[1] * octree.levels  # LC
+        self.octree = octree
+        self.features = octree.features.shape[1] * octree.levels  # LC
         self.lin1 = nn.Linear(3 + self.features, hidden)
         self.lin2 = nn.Linear(hidden, 1 + GEO)
+        ends = torch.tensor([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / math.sqrt(3)
+        self.taps = nn.Buffer(F.pad(ends, (0, 0, 1, 0)), persistent=False)  # (5,3)
 
-    def forward(self, x: Tensor, with_gradient: bool = False) -> tuple[Tensor, Tensor, Tensor]:
-        """sdf (P,), geometry (P,G) and, if wanted, grad s (P,3) at x (P,3) [D13]: the chain rule
-        by hand, ds/dx = ds/dz dz/dx with z = [x, features(x)], needs no second-order autograd."""
-        feat = self.octree(x, with_gradient)  # (P,L,1 or 4,C)
-        value, slope = feat.split([1, feat.shape[2] - 1], 2)  # (P,L,1,C), (P,L,0 or 3,C)
-        h = self.lin1(torch.cat([x, value.flatten(1)], 1))  # (P,H)
-        sdf, geo = self.lin2(F.softplus(h, BETA)).split([1, GEO], 1)  # (P,1), (P,GEO)
-        grad = None
-        if with_gradient:
-            ds_dz = (torch.sigmoid(BETA * h) * self.lin2.weight[0]) @ self.lin1.weight  # (P,3+LC)
-            ds_dx, ds_df = ds_dz.split([3, self.features], 1)  # (P,3), (P,LC)
-            ds_df = ds_df.reshape(value.shape) * self.octree.per_unit[:, None, None]  # (P,L,1,C)
-            grad = ds_dx + (slope * ds_df).sum((1, 3))  # (P,3)
-        return sdf.flatten(), torch.cat([geo, value.flatten(1)], 1), grad
+    def forward(self, x):
+        """sdf (P,) and geometry (P,G) at x (P,3)."""
+        feat = self.octree(x)  # (P,LC)
+        h = F.relu(self.lin1(torch.cat([x, feat], 1)))  # (P,H)
+        sdf, geo = self.lin2(h).split([1, GEO], 1)  # (P,1), (P,GEO)
+        return sdf[:, 0], torch.cat([geo, feat], 1)
 
-
-TAPS = F.pad(torch.tensor([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / math.sqrt(3),
-             (0, 0, 1, 0))  # (5,3) a point, and around it the ends of a tetrahedron
-MEAN = torch.tensor([-1, 0.25, 0.25, 0.25, 0.25])  # (5,) of the ends, less the point
+    def derivatives(self, x, eps):
+        """grad s (P,3) and lap s (P,) at x (P,3), from s there and at four taps, eps away."""
+        points = x[:, None] + eps * self.taps  # (P,5,3)
+        sdf, _ = self(points.flatten(0, 1))
+        return finite_differences(sdf.reshape(-1, 5), self.taps, eps)
 
 
-def taps(x: Tensor, eps: float) -> Tensor:
-    """Where finite_differences wants s around x (P,3): at x + eps k, |k| = 0 or 1. (P,5,3)"""
-    return torch.add(x[:, None], resident(TAPS, x.device).to(x.dtype), alpha=eps)
+class LipschitzLinear(nn.Linear):
+    """A layer whose rows are scaled to an L1 norm of at most a learned bound (Liu et al. 2022)."""
+    def __init__(self, inputs, outputs):
+        super().__init__(inputs, outputs)
+        largest = self.weight.detach().abs().sum(1).max()
+        self.c = nn.Parameter(torch.log(torch.expm1(largest)))  # softplus(c) is that norm
 
-
-def finite_differences(s: Tensor, eps: float) -> tuple[Tensor, Tensor]:
-    """Gradient (P,3) and Laplacian (P,) from s (P,5) at the taps (Neuralangelo)."""
-    k, mean = (resident(c, s.device).to(s.dtype) for c in (TAPS, MEAN))  # (5,3), (5,)
-    return 0.75 / eps * (s @ k), 6 / eps ** 2 * (s @ mean)  # as sum k k^T is 4/3 of the identity
-
-
-class LipschitzMLP(nn.Module):
-    """MLP whose rows are scaled to an L1 norm of at most softplus(c) (Liu et al. 2022)."""
-    def __init__(self, sizes: list[int]):
-        super().__init__()
-        self.layers = nn.ModuleList(nn.Linear(a, b) for a, b in zip(sizes, sizes[1:]))
-        bound = torch.stack([m.weight.detach().abs().sum(1).max() for m in self.layers])
-        self.c = nn.Parameter(torch.log(torch.expm1(bound)))  # (layers,)
-
-    def bounds(self) -> Tensor:
-        """Lipschitz bound of each layer in the max norm; above 0, as the loss takes its log."""
+    def bound(self):
+        """Lipschitz bound in the max norm; above 0, as the loss takes its log."""
         return F.softplus(self.c) + 1e-6
 
-    def forward(self, x: Tensor) -> Tensor:
-        rows = [len(m.weight) for m in self.layers]
-        norm = torch.cat([m.weight.abs().sum(1) for m in self.layers]) + 1e-9  # (rows,)
-        bound = torch.cat([b.expand(n) for b, n in zip(self.bounds(), rows)])  # (rows,)
-        scale = (bound / norm).clamp(max=1)[:, None].split(rows)  # (out,1) of each layer
-        for i, layer in enumerate(self.layers):
-            x = F.linear(F.relu(x) if i else x, layer.weight * scale[i], layer.bias)  # (P,out)
-        return x
+    def forward(self, x):
+        norm = self.weight.abs().sum(1, keepdim=True)  # (out,1)
+        scale = (self.bound() / norm).clamp(max=1)
+        return F.linear(x, self.weight * scale, self.bias)
+
+
+def lipschitz_loss(network):
+    """Sum of the logs of the layers' bounds. [D5]"""
+    bounds = [layer.bound() for layer in network[::2]]
+    return torch.stack(bounds).log().sum()
 
 
 # ---- 5 From SDF to colour: alpha, compositing, samples, background -------------------------------
 
 class Deviation(nn.Module):
     """The deviation network: zeta = exp(10 v), one learned number; 1/zeta is a surface's width."""
-    def __init__(self, zeta: float = 20.0):
+    def __init__(self, zeta=20.0):
         super().__init__()
         self.v = nn.Parameter(torch.tensor(math.log(zeta) / 10))
 
-    def forward(self) -> Tensor:
+    def forward(self):
         return torch.exp(10 * self.v)
 
     @torch.no_grad()
-    def bound(self, step: int, most: float) -> None:
-        """Keeps zeta above a floor, 15 at first and 80 from step 1,300 on: in a crowd, fog hides
-        people from the mask, and people that it misses keep up the fog. And below `most`: shards
-        in the air that hardly a sample meets would stay. [D15]"""
-        self.v.clamp_(math.log(min(15 + step / 20, 80)) / 10, math.log(most) / 10)
+    def bound(self, done, most):
+        """Keeps zeta above a floor, which rises from 15 to 80 in the first 43 % of training (done:
+        0..1), as in a crowd fog hides people from the mask, and people that it misses keep up the
+        fog. And below `most`: shards that hardly a sample meets would stay. [D14]"""
+        floor = 15 + 65 * min(done / 0.43, 1.0)
+        self.v.clamp_(math.log(floor) / 10, math.log(most) / 10)
 
 
-def neus_alpha(sdf: Tensor, cos: Tensor, dt: Tensor, zeta: Tensor) -> Tensor:
-    """Opacity (R,S) of sections of length dt with SDF sdf and slope cos = <grad s, d> mid-way.
-    Eq. 1 mended: 1 - sigmoid(zeta s_next) / sigmoid(zeta s_prev) (NeuS Eq. 13) [D1] with the two
-    ends s -+ cos dt / 2 inside zeta [D2]. 0 where a ray leads outwards. Logs do not overflow."""
-    half = F.relu(cos * (dt / -2))  # (R,S)
-    before, after = F.logsigmoid(zeta * torch.stack([sdf + half, sdf - half]))  # (R,S) [D2]
-    return -torch.expm1(after - before)  # [D1]
+def neus_alpha(sdf, zeta):
+    """Opacity (R,S) of the sections between samples with SDF (R,S+1). Eq. 1, mended:
+    alpha_i = max(0, 1 - sigmoid(zeta s_{i+1}) / sigmoid(zeta s_i)) (NeuS Eq. 13) [D1] [D2]"""
+    log_phi = F.logsigmoid(zeta * sdf)  # (R,S+1), which does not overflow
+    fall = torch.diff(log_phi).clamp(max=0)  # (R,S) 0 where the ray leads outwards
+    return -torch.expm1(fall)
 
 
-def printed_alpha(sdf: Tensor, cos: Tensor, dt: Tensor, zeta: Tensor) -> Tensor:
-    """Eq. 1 as printed, kept to be shown and tested: sums to one, but multiplies to 1 - 1/e."""
-    beta = cos * dt / 2  # (R,S)
-    after = torch.cat([sdf[:, 1:], sdf[:, -1:]], 1)  # (R,S), s_{i+1}
-    return torch.sigmoid(zeta * sdf + beta) - torch.sigmoid(zeta * after + beta)
-
-
-def composite(alpha: Tensor) -> tuple[Tensor, Tensor]:
+def composite(alpha):
     """Weights w_i = T_i alpha_i (R,S), T_i = prod_{j<i} (1 - alpha_j); what passes, T (R,). Eq. 2
-    A sum of logs: its backward needs no look for zeros; opaque sections still pass 1e-6 [D1]."""
+    As a sum of logs; an opaque section still passes 1e-6, or the log would be infinite."""
     passes = torch.log1p((1e-6 - 1) * alpha)  # (R,S) log of what passes a section
-    w = torch.exp(passes.cumsum(1) - passes) * alpha  # (R,S)
+    trans = torch.exp(passes.cumsum(1) - passes)  # (R,S) T_i
+    w = trans * alpha
     return w, 1 - w.sum(1)
 
 
-def inverse_cdf(edges: Tensor, weight: Tensor, u: Tensor) -> Tensor:
+def inverse_cdf(edges, weight, u):
     """Positions (R,S) where the linear CDF of weight (R,N) on edges (R,N+1) reaches u (R,S)."""
     cdf = torch.cumsum(weight, 1)
     cdf = F.pad(cdf / cdf[:, -1:], (1, 0))  # (R,N+1)
-    hi = torch.searchsorted(cdf, u.contiguous(), right=True).clamp(1, weight.shape[1])  # (R,S)
-    both = torch.cat([hi - 1, hi], 1)  # (R,2S)
-    (c0, c1), (e0, e1) = cdf.gather(1, both).chunk(2, 1), edges.gather(1, both).chunk(2, 1)  # (R,S)
-    return torch.lerp(e0, e1, ((u - c0) / (c1 - c0).clamp(min=1e-9)).clamp(0, 1))
+    right = torch.searchsorted(cdf, u, right=True).clamp(1, weight.shape[1])  # (R,S)
+    left = right - 1
+    below = cdf.gather(1, left)
+    width = cdf.gather(1, right) - below
+    part = (u - below) / width.clamp(min=1e-9)
+    return torch.lerp(edges.gather(1, left), edges.gather(1, right), part.clamp(0, 1))
 
 
 PROBES = 64  # cheap lookups of the cached SDF per ray
-FLOOR = 0.2  # share of samples spread uniformly, so that a lost surface can return
+UNIFORM_SHARE = 0.2  # of samples, spread evenly, so that a lost surface can return
 
 
 class SDFCache(nn.Module):
     """The SDF of the last steps on a dense grid: where along a ray samples pay. [D11]"""
-    def __init__(self, n: int):
+    def __init__(self, n):
         super().__init__()
         self.volume = nn.Buffer(torch.zeros(1, 1, n, n, n))  # x slowest
 
     @torch.no_grad()
-    def refresh(self, sdf, part: int = 0, parts: int = 1) -> None:
+    def refresh(self, sdf, part=0, parts=1):
         """Evaluates sdf, (P,3) to (P,), again on every parts-th slice, from slice `part`."""
         n = self.volume.shape[-1]
         line = torch.linspace(-1, 1, n, device=self.volume.device)  # (n,)
         x = torch.cartesian_prod(line[part::parts], line, line)  # (P,3)
-        size = 2 ** 18 if x.is_cuda else 2 ** 15  # few calls for a GPU, what fits a CPU's cache
-        s = torch.cat([sdf(some) for some in x.split(size)])  # (P,)
-        self.volume[0, 0, part::parts] = s.reshape(-1, n, n)
+        self.volume[0, 0, part::parts] = in_chunks(sdf, x).reshape(-1, n, n)
 
-    def weights(self, rays: Rays, edges: Tensor, zeta: Tensor) -> Tensor:
-        """NeuS weights (R,N) of sections (R,N+1); surfaces are at least half a voxel wide."""
-        x = rays.at(edges).flip(-1)[None, None]  # (1,1,R,N+1,3) as grid_sample wants it, z first
-        s = F.grid_sample(self.volume, x, padding_mode="border", align_corners=True)[0, 0, 0]
-        log_phi = F.logsigmoid(zeta.clamp(max=self.volume.shape[-1]) * s)  # (R,N+1)
-        fall = F.pad(torch.diff(log_phi).clamp(max=0), (1, 0))  # (R,N+1) log of what passes
-        return -torch.diff(fall.cumsum(1).exp())  # (R,N)
+    def sdf(self, x):
+        """s (R,N) at x (R,N,3), trilinear."""
+        grid = x.flip(-1)[None, None]  # (1,1,R,N,3), z first as grid_sample wants it
+        s = F.grid_sample(self.volume, grid, padding_mode="border", align_corners=True)
+        return s[0, 0, 0]
 
     @torch.no_grad()
-    def edges(self, rays: Rays, t0: Tensor, t1: Tensor, jitter: Tensor, zeta: Tensor) -> Tensor:
-        """Edges (R,S+1) of S sections from t0 to t1 (R,), dense where a surface is seen; even ones
-        if zeta is 0. jitter: (R,S) in 0..1, stratifies the S - 1 inner edges."""
-        n, t0, t1 = jitter.shape[1] - 1, t0[:, None], t1[:, None]  # (R,1)
-        u = (torch.arange(n, device=t0.device) + jitter[:, :n]) / n  # (R,S-1)
-        probes = torch.lerp(t0, t1, torch.linspace(0, 1, PROBES + 1, device=t0.device))  # (R,N+1)
-        weight = self.weights(rays, probes, zeta)  # (R,N)
-        weight = torch.add(weight + 1e-5, weight.sum(1, keepdim=True),
-                           alpha=FLOOR / (1 - FLOOR) / PROBES)  # (R,N)
-        return torch.cat([t0, inverse_cdf(probes, weight, u), t1], 1)  # (R,S+1)
+    def distances(self, rays, t0, t1, jitter, zeta):
+        """Distances (R,S+1) of samples from t0 to t1 (R,1), dense where a surface is seen. jitter:
+        (R,S-1) in 0..1, stratifies those between the ends."""
+        share = torch.linspace(0, 1, PROBES + 1, device=t0.device)
+        probes = torch.lerp(t0, t1, share)  # (R,N+1)
+        zeta = zeta.clamp(max=self.volume.shape[-1])  # surfaces at least half a voxel wide
+        weight, _ = composite(neus_alpha(self.sdf(rays.at(probes)), zeta))  # (R,N)
+        even = UNIFORM_SHARE / (1 - UNIFORM_SHARE) * weight.mean(1, keepdim=True)
+        n = jitter.shape[1]
+        u = (torch.arange(n, device=t0.device) + jitter) / n  # (R,S-1)
+        inner = inverse_cdf(probes, weight + even + 1e-5, u)
+        return torch.cat([t0, inner, t1], 1)
 
 
-def contract(x: Tensor) -> Tensor:
+def contract(x):
     """Squeezes |x| > 1 into the ball of radius 2 (mip-NeRF 360 Eq. 10); identity inside."""
-    inverse = x.norm(dim=-1, keepdim=True).clamp(min=1).reciprocal()  # (...,1) 1 / |x|
+    inverse = 1 / x.norm(dim=-1, keepdim=True).clamp(min=1)  # (...,1)
     return x * (2 - inverse) * inverse
 
 
 class Background(nn.Module):
     """A small NeRF before the sphere and beyond it, on an octree over contracted space."""
-    def __init__(self, points: Tensor, hidden: int, per_ray: int):
+    def __init__(self, points, hidden, per_ray):
         super().__init__()
-        self.octree = Octree(2.0, levels=5, device=points.device)
-        seed_octree(self.octree, contract(points), 1, 3)  # three levels only near SfM points (K,3)
-        inputs = 3 + self.octree.features.shape[1] * self.octree.levels
-        self.density, self.color = (
-            nn.Sequential(nn.Linear(a, hidden), nn.ReLU(), nn.Linear(hidden, b))
-            for a, b in ((inputs, 1 + GEO), (GEO + per_ray, 3)))
+        self.octree = Octree(2.0, levels=5)
+        seed_octree(self.octree, contract(points), dense=1, near=3)  # SfM points (K,3)
+        features = self.octree.features.shape[1] * self.octree.levels
+        self.density = mlp(3 + features, hidden, 1 + GEO)
+        self.color = mlp(GEO + per_ray, hidden, 3)
 
-    def forward(self, rays: Rays, t0: Tensor, t1: Tensor, per_ray: Tensor, jitter: Tensor):
-        """Colour (R,3) of what lies before t0 (R,), the share (R,) of light that passes it, and
-        that share of the colour (R,3) beyond t1 (R,). per_ray: (R,9+A) direction, code; jitter
-        (R,S) in 0..1. [D8] A third of the S sections are equal and end at t0; the others are
-        equal steps of u in t = t1 + u / (1 - u), and the last is opaque."""
-        (R, S), n = jitter.shape, jitter.shape[1] // 3
-        at, dt = torch.arange(S, device=t0.device) + jitter, (t0 - rays.near)[:, None] / n  # (R,1)
-        before = torch.addcmul(rays.near[:, None], dt, at[:, :n])  # (R,n)
-        u = (at[:, n:] - n) / (S - n)  # (R,S-n)
-        beyond = torch.addcdiv(t1[:, None], u, (1 - u).clamp(min=1e-3))  # (R,S-n)
-        x = contract(rays.at(torch.cat([before, beyond], 1))).reshape(-1, 3)  # (RS,3)
-        feat = torch.cat([x, self.octree(x).flatten(1)], 1)  # (RS,3+LC)
-        density, geo = self.density(feat).split([1, GEO], 1)  # (RS,1), (RS,GEO)
+    def forward(self, rays, t0, t1, per_ray, jitter):
+        """Colour (R,3) of what lies before t0 (R,1); the share (R,1) of light that passes it; that
+        share of the colour (R,3) beyond t1 (R,1). per_ray: (R,9+A) direction and code; jitter
+        (R,S) in 0..1. A sixth of the S samples lies before the sphere, evenly; the others are
+        even in u, at a distance u / (1 - u) behind it. The last is opaque. [D8]"""
+        R, S = jitter.shape
+        n = S // 6
+        place = torch.arange(S, device=t0.device) + jitter  # (R,S)
+        before = torch.lerp(rays.near, t0, place[:, :n] / n)  # (R,n)
+        u = (place[:, n:] - n) / (S - n)  # (R,S-n)
+        beyond = u / (1 - u).clamp(min=1e-3)
+        path = torch.cat([before, t0 + beyond], 1)  # (R,S) without the sphere's part
+        t = torch.cat([before, t1 + beyond], 1)  # (R,S)
+        x = contract(rays.at(t)).flatten(0, 1)  # (RS,3)
+        inputs = torch.cat([x, self.octree(x)], 1)  # (RS,3+LC)
+        density, geo = mixed_precision(self.density, inputs).split([1, GEO], 1)
         inputs = torch.cat([geo, per_ray.repeat_interleave(S, 0)], 1)  # (RS,GEO+9+A)
-        rgb = self.color(inputs).sigmoid().reshape(R, S, 3)  # (R,S,3)
-        sigma = F.softplus(density.reshape(R, S) - 1)[:, :-1]  # (R,S-1)
-        dt = torch.cat([dt.expand(-1, n), torch.diff(beyond)], 1)  # (R,S-1)
-        alpha = F.pad(-torch.expm1(-sigma * dt), (0, 1), value=1.0)  # (R,S) [D8]
-        w, _ = composite(alpha)  # (R,S)
+        rgb = mixed_precision(self.color, inputs).sigmoid().reshape(R, S, 3)
+        sigma = F.softplus(density.reshape(R, S) - 1)
+        alpha = 1 - torch.exp(-sigma[:, :-1] * torch.diff(path))  # (R,S-1)
+        w, _ = composite(F.pad(alpha, (0, 1), value=1.0))  # (R,S)
         front, behind = (w[:, :, None] * rgb).split([n, S - n], 1)
-        return front.sum(1), 1 - w[:, :n].sum(1), behind.sum(1)  # (R,3), (R,), (R,3)
+        passes = 1 - w[:, :n].sum(1, keepdim=True)
+        return front.sum(1), passes, behind.sum(1)
 
 
-def render_rays(model: "GeoNVS", rays: Rays, code: Tensor, jitter: Tensor) -> dict[str, Tensor]:
-    """One ray batch through the whole model. code: (R,A) appearance; jitter in 0..1, for S samples
-    and the background's. Returns rgb (R,3), eikonal error of each sample (R,S), and without
-    gradient opacity, mean depth (R,), normal, the point there x (R,3), E_grad of Eq. 4 (R,)."""
-    cfg, R, S, zeta = model.cfg, len(rays.o), model.cfg.samples, model.deviation()
-    t0, t1 = sphere_interval(rays)  # (R,)
-    seen_zeta = zeta if cfg.sampling == "cached" else 0 * zeta  # 0: nothing is seen, even sections
-    edges = model.cache.edges(rays, t0, t1, jitter[:, :S], seen_zeta)  # (R,S+1) [D11]
-    t = torch.lerp(edges[:, :-1], edges[:, 1:], 0.5)  # (R,S)
-    x = rays.at(t).reshape(-1, 3)  # (RS,3)
-    sdf, geo, grad = model.sdf(x, cfg.normals == "analytic")  # (RS,), (RS,G), (RS,3) [D13]
-    if cfg.normals == "fd":
-        ends = model.distance(taps(x, model.eps)[:, 1:].reshape(-1, 3)).reshape(-1, 4)  # (RS,4)
-        grad, _ = finite_differences(torch.cat([sdf[:, None], ends], 1), model.eps)  # (RS,3)
-    length = grad.norm(dim=1, keepdim=True)  # (RS,1)
-    normal = grad / (length + 1e-12)  # (RS,3)
-    cos = torch.einsum("rsi,ri->rs", grad.reshape(R, S, 3), rays.d)  # (R,S)
-    opacity_of = neus_alpha if cfg.alpha == "neus" else printed_alpha
-    alpha = opacity_of(sdf.reshape(R, S), cos, torch.diff(edges), zeta)  # (R,S)
-    w, trans = composite(alpha)  # (R,S), (R,); 0 and 1 where a ray misses: no section has a length
-    d = rays.d  # its polynomials up to degree 2 span the spherical harmonics
-    per_ray = torch.cat([d, d * d, d * d.roll(1, 1), code], 1)  # (R,9+A)
-    inputs = torch.cat([geo, normal, per_ray.repeat_interleave(S, 0)], 1)  # (RS,G+3+9+A)
-    rgb = torch.einsum("rs,rsc->rc", w, model.color(inputs).sigmoid().reshape(R, S, 3))  # (R,3)
+def direction_code(d):
+    """Polynomials (R,9) of d (R,3), which span the spherical harmonics up to degree 2."""
+    return torch.cat([d, d * d, d * d.roll(1, 1)], 1)
+
+
+def render_rays(model, rays, code, jitter):
+    """One ray batch through the whole model. code: (R,A) appearance; jitter in 0..1, for S - 1
+    samples of the foreground and for the background's. Returns rgb (R,3), opacity (R,); without
+    gradient depth (R,) and end (R,3), where the ray ends; there normal (R,3), e_grad, e_curv (R,);
+    distances t (R,S+1); is_inside (R,), whether the ray meets the sphere."""
+    S = model.cfg.samples
+    zeta = model.deviation()
+    t0, t1 = sphere_interval(rays)  # (R,1)
+    t = model.cache.distances(rays, t0, t1, jitter[:, 1:S].contiguous(), zeta)  # (R,S+1)
+    sdf, geo = model.sdf(rays.at(t).flatten(0, 1))  # (R(S+1),), (R(S+1),G)
+    alpha = neus_alpha(sdf.reshape(t.shape), zeta)  # (R,S)
+    w, trans = composite(alpha)  # (R,S), (R,)
+    w = (F.pad(w, (1, 0)) + F.pad(w, (0, 1))) / 2  # (R,S+1) half to each end of a section
+
+    depth = ((w * t).sum(1) + trans * t1[:, 0]).detach()  # (R,)
+    end = rays.at(depth[:, None])[:, 0]  # (R,3)
+    grad, lap = model.sdf.derivatives(end, model.eps)  # (R,3), (R,)
+    normal = F.normalize(grad)
+
+    per_ray = torch.cat([direction_code(rays.d), code], 1)  # (R,9+A)
+    of_samples = torch.cat([normal, per_ray], 1).repeat_interleave(S + 1, 0)
+    inputs = torch.cat([geo, of_samples], 1)  # (R(S+1),G+3+9+A)
+    rgb = mixed_precision(model.color, inputs).sigmoid()
+    rgb = torch.einsum("rs,rsc->rc", w, rgb.reshape(*t.shape, 3))  # (R,3)
     if model.background is None:
-        front, passes, behind = 0, trans.new_ones(R), model.bg_color
+        rgb = rgb + trans[:, None] * model.bg_color
     else:
         front, passes, behind = model.background(rays, t0, t1, per_ray, jitter[:, S:])
-    eikonal = ((length - 1) ** 2).reshape(R, S) * (t1 > t0)[:, None]  # a miss has none
-    with torch.no_grad():
-        depth = torch.addcmul(torch.einsum("rs,rs->r", w, t), trans, t1)  # (R,)
-        seen = dict(opacity=(1 - trans).clamp(min=0), depth=depth, x=rays.at(depth[:, None])[:, 0],
-                    normal=torch.einsum("rs,rsi->ri", w, normal.reshape(R, S, 3)),
-                    e_grad=torch.einsum("rs,rs->r", w, eikonal))  # NeuS-weighted [D3]
-    rgb = front + passes[:, None] * rgb + trans[:, None] * behind  # (R,3)
-    return seen | dict(rgb=rgb, eikonal=eikonal)
+        rgb = front + passes * rgb + trans[:, None] * behind
+    return dict(
+        rgb=rgb,
+        opacity=1 - trans,
+        depth=depth,
+        end=end,
+        normal=normal,
+        e_grad=(grad.norm(dim=1) - 1) ** 2,
+        e_curv=lap.abs() * model.eps * (1 - trans.detach()),  # [D4]
+        t=t,
+        is_inside=(t1 > t0)[:, 0])
 
 
 # ---- 6 Photos in the wild: transient mask and geometry preservation ------------------------------
 
-def conv(cin: int, cout: int, stride: int) -> nn.Sequential:
-    return nn.Sequential(nn.Conv2d(cin, cout, 3, stride, 1, bias=False),
-                         nn.GroupNorm(8, cout), nn.ReLU())  # [D6]
+def conv(inputs, outputs, stride):
+    return nn.Sequential(
+        nn.Conv2d(inputs, outputs, 3, stride, padding=1, bias=False),
+        nn.GroupNorm(8, outputs),
+        nn.ReLU())  # [D6]
 
 
 class ContextBlock(nn.Module):
     """Context-guided block (CGNet Fig. 3) at half the resolution: local and dilated context, gated
     globally; no residual, no 1x1. [D6]"""
-    def __init__(self, cin: int, cout: int, dilation: int):
+    def __init__(self, inputs, outputs, dilation):
         super().__init__()
-        half = cout // 2
-        self.reduce = conv(cin, half, 2)
-        self.local = nn.Conv2d(half, half, 3, 1, 1, groups=half, bias=False)
-        self.around = nn.Conv2d(half, half, 3, 1, dilation, dilation, half, bias=False)
-        self.join = nn.Sequential(nn.GroupNorm(8, cout), nn.ReLU())
-        self.gate = nn.Sequential(nn.Linear(cout, cout // 8), nn.ReLU(),
-                                  nn.Linear(cout // 8, cout), nn.Sigmoid())
+        half = outputs // 2
+        self.reduce = conv(inputs, half, stride=2)
+        self.local = nn.Conv2d(half, half, 3, padding=1, groups=half)
+        self.around = nn.Conv2d(
+            half, half, 3, padding=dilation, dilation=dilation, groups=half)
+        self.norm = nn.GroupNorm(8, outputs)
+        self.gate = mlp(outputs, outputs // 8, outputs)
 
-    def forward(self, x: Tensor) -> Tensor:
-        y = self.reduce(x)  # (B,cout/2,h/2,w/2)
-        y = self.join(torch.cat([self.local(y), self.around(y)], 1))  # (B,cout,h/2,w/2)
-        return y * self.gate(y.mean((2, 3)))[:, :, None, None]
+    def forward(self, x):
+        y = self.reduce(x)  # (B,outputs/2,h/2,w/2)
+        y = torch.cat([self.local(y), self.around(y)], 1)
+        y = F.relu(self.norm(y))  # (B,outputs,h/2,w/2)
+        gate = self.gate(y.mean((2, 3))).sigmoid()  # (B,outputs)
+        return y * gate[:, :, None, None]
 
 
 class CGNet(nn.Module):
@@ -632,316 +713,360 @@ class CGNet(nn.Module):
     The head reads all three resolutions: at 1/8 alone a mask could not follow an outline."""
     def __init__(self):
         super().__init__()
-        self.stages = nn.ModuleList([nn.Sequential(conv(3, 16, 2), conv(16, 16, 1)),
-                                     ContextBlock(16, 32, 2), ContextBlock(32, 64, 4)])
-        self.heads = nn.ModuleList(nn.Conv2d(k, 1, 1) for k in (16, 32, 64))
-        for head, bias in zip(self.heads, (-2.5, 0.0, 0.0)):
-            nn.init.constant_(head.bias, bias)  # starts with 8 % masked, not with half the picture
+        self.stage1 = nn.Sequential(conv(3, 16, stride=2), conv(16, 16, stride=1))
+        self.stage2 = ContextBlock(16, 32, dilation=2)
+        self.stage3 = ContextBlock(32, 64, dilation=4)
+        self.head1 = nn.Conv2d(16, 1, 1)
+        self.head2 = nn.Conv2d(32, 1, 1)
+        self.head3 = nn.Conv2d(64, 1, 1)
+        nn.init.constant_(self.head1.bias, -2.5)  # starts with 8 % masked, not with half
 
-    def forward(self, photo: Tensor) -> Tensor:
-        y, logits = photo - 0.5, []
-        for stage, head in zip(self.stages, self.heads):
-            y = stage(y)  # (B,16,H/2,W/2), (B,32,H/4,W/4), (B,64,H/8,W/8)
-            logits.append(head(y))
-        size = logits[0].shape[2:]
-        return sum(F.interpolate(z, size, mode="bilinear") for z in logits)  # (B,1,H/2,W/2)
+    def forward(self, photo):
+        y1 = self.stage1(photo - 0.5)  # (B,16,H/2,W/2)
+        y2 = self.stage2(y1)  # (B,32,H/4,W/4)
+        y3 = self.stage3(y2)  # (B,64,H/8,W/8)
+        size = y1.shape[2:]
+        middle = F.interpolate(self.head2(y2), size, mode="bilinear")
+        coarse = F.interpolate(self.head3(y3), size, mode="bilinear")
+        return self.head1(y1) + middle + coarse  # (B,1,H/2,W/2)
 
 
-def mask_at(logits: Tensor, uv: Tensor) -> Tensor:
-    """M (R,) at uv (R,2) in 0..1 of logits (B,1,h,w); rays come photo by photo, R / B from each."""
+def sample_logits(logits, uv):
+    """Logits (R,) at uv (R,2) in 0..1 of logits (B,1,h,w); rays come photo by photo, R / B each."""
     grid = (2 * uv - 1).reshape(len(logits), -1, 1, 2)  # (B,R/B,1,2)
-    at = F.grid_sample(logits, grid, padding_mode="border", align_corners=False)  # (B,1,R/B,1)
-    return torch.sigmoid(at).flatten()  # (R,)
+    at = F.grid_sample(logits, grid, padding_mode="border", align_corners=False)
+    return at.flatten()
 
 
-LAM_GRAD, LAM_LAP = 10.0, 2.0  # lambda_grad and lambda_curv inside Phi (paper)
-LAM_BIMODAL = 1e-4  # weight of a term that is largest at M = 1/2; a large one no M could cross
-MASK_EVERY = 4  # steps from one lesson of the mask network to the next [D14]
+def complexity(e_grad, e_curv):
+    """lambda_grad E_grad + lambda_curv E_curv with the paper's weights. Eq. 4"""
+    return 10.0 * e_grad + 2.0 * e_curv
 
 
-def edge_indicator(bend: Tensor, calibration=(0.0, 1.0)) -> Tensor:
-    """Phi of bend = lambda_grad E_grad + lambda_curv E_curv, any shape. Eq. 4 calibration: centre
-    and width of the sigmoid [D3]; 0 and 1 are the literal reading: Phi is over 0.5 on all rays."""
-    return torch.sigmoid((bend - calibration[0]) / calibration[1])
+def edge_indicator(complexity, centre=0.0, width=1.0):
+    """Phi: a sigmoid of complexity (R,). Eq. 4
+    Its centre and width are calibrated [D3]: with 0 and 1 Phi is above 0.5 on every ray."""
+    return torch.sigmoid((complexity - centre) / width)
 
 
-def gpl_loss(mask: Tensor, edge: Tensor) -> Tensor:
+def gpl_loss(mask, phi):
     """Geometry-preservation loss: mean of M(r) Phi(r). Eq. 3"""
-    return (mask * edge).mean()
+    return (mask * phi).mean()
+
+
+def transient_loss(logit, error, price):
+    """Teaches M = 1 to rays whose error (R,) exceeds their price (R,), M = 0 to the others: the
+    optimum of (1 - M) error + M price, with a slope where a sigmoid has none. [D7]"""
+    is_transient = (error > price).float()
+    weight = (error - price).abs()
+    return F.binary_cross_entropy_with_logits(logit, is_transient, weight)
+
+
+def follow_quantiles(running, shares, values, is_meant, rate=0.1):
+    """Moves `running` (Q,), above 0, towards the quantiles `shares` (Q,) of those values (R,) that
+    are meant, by a factor: up where too many of them lie above it."""
+    is_below = (values[:, None] < running) & is_meant[:, None]  # (R,Q)
+    count = is_meant.sum()
+    excess = (count * shares - is_below.sum(0)) / count.clamp(min=1)  # (Q,) 0 if none is meant
+    running *= torch.exp(rate * excess)
+
+
+LEAST_PRICE = 0.15  # error of a ray below which it is never transient
 
 
 class TransientMask(nn.Module):
-    """M, which pixels show what passes by: CGNet, what rays last found at each pixel of each photo,
-    and the objective that it learns from. m: side of the logits, px."""
-    def __init__(self, cfg: Config, scene: Scene):
+    """M, which pixels show what passes by: CGNet on small photos, and what prices depend on."""
+    def __init__(self, scene):
         super().__init__()
-        self.cfg, self.thumbs, self.cgnet = cfg, scene.thumbs, CGNet()
-        I, m = len(scene.thumbs), (scene.thumbs.shape[3] + 1) // 2
-        self.logits = nn.Buffer(torch.full((I, 1, m, m), -9.0))  # last output of the network
-        self.seen = nn.Buffer(torch.full((I, 5, m, m), -1.0))  # residual, bend, opacity; -1: no ray
-        self.calibration = nn.Buffer(torch.tensor([0.0, 1.0]))  # centre and width of Phi
-        # running upper quartiles of errors at SfM points: beside the foreground, and of it
-        self.usual = nn.Buffer(torch.full((2,), 0.3))
-        # which pixels show SfM points
-        self.static = nn.Buffer(scene.is_test.new_zeros(I, 1, m, m), persistent=False)
-        ok = ((scene.track_uv >= 0) & (scene.track_uv < 1)).all(1)  # not those that SfM got wrong
-        col, row = (scene.track_uv[ok] * m).long().unbind(1)  # (T,)
-        self.static[scene.track_photo[ok], 0, row, col] = True  # a few wrongly, on outlines [D10]
+        self.cgnet = CGNet()
+        self.thumbs = nn.Buffer(scene.thumbs, persistent=False)
+        self.quantiles = constant(0.5, 0.75, 0.95)
+        self.complexity = nn.Buffer(torch.tensor([0.5, 1.0, 4.0]))  # of the foreground
+        self.sfm_error = nn.Buffer(torch.tensor([0.3]))  # upper quartile of rays at SfM points
+        # which pixels of small photos show SfM points; some wrongly, at outlines [D10]
+        n = scene.thumbs.shape[3] // 2
+        static = torch.zeros(len(scene.thumbs), n, n, dtype=torch.bool)
+        is_seen = ((scene.track_uv >= 0) & (scene.track_uv < 1)).all(1)  # (T,)
+        col, row = (scene.track_uv[is_seen] * n).long().unbind(1)
+        static[scene.track_photo[is_seen], row, col] = True
+        self.static = nn.Buffer(static, persistent=False)
 
-    def look(self, pick: Tensor) -> Tensor:
+    def logits(self, photos):
         """Logits (B,1,m,m) of photos (B,)."""
-        return self.cgnet(self.thumbs[pick].float() / 255)
+        return self.cgnet(self.thumbs[photos] / 255)
 
-    def remember(self, rays: Rays, residual: Tensor, bend: Tensor, opacity: Tensor) -> None:
-        """Keeps residual (R,3), bend and opacity (R,) where the network will look for them."""
-        m = self.seen.shape[-1]
-        col, row = (rays.uv * m).long().unbind(1)  # (R,)
-        found = torch.cat([residual, bend[:, None], opacity[:, None]], 1)  # (R,5)
-        self.seen[rays.img, :, row, col] = found.nan_to_num(0, 0, 0)
+    def share(self, photos):
+        """Mean M (B,) of photos (B,)."""
+        return torch.cat([self.logits(i).sigmoid().mean((1, 2, 3)) for i in photos.split(1)])
 
-    def calibrate(self, bend: Tensor, rate: float = 0.2) -> None:
-        """Moves Phi's centre and width to the rays': p75 and (p95 - p50) / 4 of bend (R,). [D3]"""
-        order, last = bend.nan_to_num(0, 0, 0).sort()[0], len(bend) - 1  # (R,)
-        p50, p75, p95 = (order[int(q * last)] for q in (0.5, 0.75, 0.95))
-        self.calibration.lerp_(torch.stack([p75, ((p95 - p50) / 4).clamp(min=1e-3)]), rate)
+    def is_static(self, rays):
+        """Which rays (R,) go through pixels that show SfM points."""
+        col, row = (rays.uv * self.static.shape[1]).long().unbind(1)
+        return self.static[rays.img, row, col]
 
-    def phi(self, pick: Tensor) -> Tensor:
-        """Phi times opacity (B,1,m,m) of photos (B,) as rays found it; 0 where none came."""
-        bend, opacity = self.seen[pick, 3:].split(1, 1)  # (B,1,m,m)
-        return opacity.clamp(min=0) * edge_indicator(bend, self.calibration)  # [D3]
+    def phi(self, complexity, opacity):
+        """Phi (R,): 0.5 for the upper quartile of what rays find on the foreground. [D3]"""
+        p50, p75, p95 = self.complexity
+        width = ((p95 - p50) / 4).clamp(min=1e-3)
+        return opacity * edge_indicator(complexity, p75, width)
 
-    def objective(self, pick: Tensor) -> tuple[Tensor, Tensor]:
-        """The terms of Eq. 5 that hold M, over photos (B,), a pixel that no ray has seen being 0,
-        and L_GPL alone. M = 1 costs a price and saves the error, a signed mean over 3x3 pixels of
-        the worst channel: what a blurred model lacks cancels, people do not. At pixels that show
-        SfM points M saves nothing; their errors set the price. The logistic surrogate of (price -
-        error) M has its sign and optimum, and a slope while M is wrong, where a sigmoid has none
-        [D14]. --mask printed has none of this: mean M^2 is the price, as in Ha-NeRF."""
-        cfg, logits, phi = self.cfg, self.look(pick), self.phi(pick)  # (B,1,m,m)
-        self.logits[pick] = logits.detach()
-        residual, known = self.seen[pick, :3], (self.seen[pick, 4:] >= 0).float()  # (B,3 or 1,m,m)
-        mask, static = logits.sigmoid(), self.static[pick]  # (B,1,m,m)
-        gpl = gpl_loss(mask, phi)
-        pole = LAM_BIMODAL * (1 / ((mask - 0.5) ** 2 + 0.02)).mean()  # to 0 or 1 (Ha-NeRF's digits)
-        if cfg.mask == "printed":
-            error = residual.abs().mean(1, keepdim=True)  # (B,1,m,m)
-            paid = ((1 - mask) * error + cfg.lam_mask * mask ** 2) * known  # (B,1,m,m)
-            return paid.mean() + pole + cfg.lam_gpl * gpl, gpl.detach()
-        around = F.avg_pool2d(torch.cat([residual * known, known], 1), 3, 1, 1)  # (B,4,m,m)
-        error = (around[:, :3] / around[:, 3:].clamp(min=0.1)).abs().amax(1, True)  # (B,1,m,m)
-        solid = self.seen[pick, 4:] > 0.5  # (B,1,m,m) the foreground, or what is beside it
-        told = torch.stack([~solid, solid]) & static & (known > 0)  # (2,B,1,m,m) at SfM points
-        usual = torch.where(told, error, math.nan).flatten(1).nanquantile(0.75, 1)  # (2,)
-        self.usual.lerp_(torch.where(usual.isnan(), self.usual, usual), 0.1)
-        price = cfg.lam_mask + self.usual[solid.long()] + cfg.lam_gpl * phi  # (B,1,m,m) [D7]
-        loss = price - error * ~static  # (B,1,m,m) of M = 1 instead of 0
-        slope = F.softplus(torch.where(loss > 0, logits, -logits))  # (B,1,m,m)
-        return (loss.abs() * slope * known).mean() + pole, gpl.detach()
+    def price(self, phi, lam_mask, lam_gpl):
+        """The error (R,) above which a ray is transient. [D7]"""
+        usual = (lam_mask + self.sfm_error).clamp(min=LEAST_PRICE)
+        return usual + lam_gpl * phi
 
 
 # ---- 7 The model and its objective ---------------------------------------------------------------
 
+def is_on(setting, default):
+    """Of a part of the model, "auto", "on" or "off". [D15]"""
+    return default if setting == "auto" else setting == "on"
+
+
 class GeoNVS(nn.Module):
-    """The paper's model: it assembles the parts above and sums their losses. What stands from
-    `losses` on is what training and scoring ask of any model; rivals in the tests answer too."""
-    name, terms = "geonvsw", ("rgb", "eik", "curv", "lps", "off", "sfm")  # the mask has its own
+    """The paper's model: it assembles the parts above and sums their losses. To be made under
+    torch.device(the scene's)."""
+    name = "geonvsw"
     adam = dict(betas=(0.9, 0.99), eps=1e-15)  # as is usual for feature grids (Instant-NGP)
 
-    def __init__(self, cfg: Config, scene: Scene):
+    def __init__(self, cfg, scene):
         super().__init__()
-        self.cfg = cfg = replace(cfg)  # a copy, as training decides --mask auto
-        self.scene, raw, dev = scene, scene.raw, scene.c2w.device
-        inside = scene.points.norm(dim=1) < 1
-        self.sfm = scene.points[inside]  # (K,3)
-        fit = 1 + math.floor(math.log2(2 / raw["footprint"] / 16))  # no cell smaller than a pixel
-        levels = cfg.levels or min(max(fit, 2), 8)
-        held = 20 * 16 ** 3 * 8 ** levels / 2 ** 20  # MiB, 140 bytes for a cell of a uniform grid
-        need(cfg.grid == "octree" or held < cfg.max_mb, f"a uniform grid of {levels} levels takes "
-             f"{held:.0f} MiB: lower --levels or raise --max_mb")
-        octree = Octree(1.0, levels, device=dev)
-        seed_octree(octree, self.sfm, 1 if cfg.grid == "octree" else levels - 1)
-        has_codes = dict(on=True, off=False, auto=raw["exposure_spread"] > 0.01)[cfg.appearance]
-        has_field = dict(on=True, off=False, auto=np.isnan(raw["bg_color"]).any())[cfg.background]
-        A = cfg.appearance_dim if has_codes else 0  # [D16]
+        self.cfg = replace(cfg)  # a copy, as training decides --mask auto
+        self.scene = scene
+        raw = scene.raw
+        levels = cfg.levels
+        if levels == 0:  # no cell smaller than a pixel
+            levels = 1 + math.floor(math.log2(2 / raw["footprint"] / 16))
+            levels = min(max(levels, 2), 8)
+        A = 0
+        if is_on(cfg.appearance, raw["exposure_spread"] > 0.01):
+            A = cfg.appearance_dim
+        is_inside = scene.points.norm(dim=1) < 1
+        self.sfm = nn.Buffer(scene.points[is_inside], persistent=False)  # (K,3)
+        octree = Octree(1.0, levels)
+        seed_octree(octree, self.sfm, dense=1, near=1)
         self.sdf = SDFField(octree, cfg.hidden)
-        self.appearance = nn.Embedding(len(scene.wh), A).requires_grad_(A > 0)  # at 0 CUDA errs
+        self.color = nn.Sequential(
+            LipschitzLinear(GEO + self.sdf.features + 3 + 9 + A, cfg.hidden),
+            nn.ReLU(),
+            LipschitzLinear(cfg.hidden, cfg.hidden),
+            nn.ReLU(),
+            LipschitzLinear(cfg.hidden, 3))
+        self.appearance = nn.Embedding(len(scene.wh), A).requires_grad_(A > 0)
         nn.init.normal_(self.appearance.weight, std=0.01)
-        self.color = LipschitzMLP([GEO + self.sdf.features + 3 + 9 + A, cfg.hidden, cfg.hidden, 3])
-        self.background = (Background(scene.points[~inside], cfg.hidden, 9 + A)
-                           if has_field else None)
-        self.octrees = [part.octree for part in (self.sdf, self.background) if part]
-        self.deviation, self.mask = Deviation(), TransientMask(cfg, scene)
-        self.cache = SDFCache(int(np.clip(octree.root << levels - 1, 64, 128)))
-        self.bg_color = nn.Buffer(torch.as_tensor(raw["bg_color"]).float().nan_to_num(0.5))
-        self.hits = nn.Buffer(torch.full((512 * cfg.rays, 5), 2.0))  # what refined_keys looks at
-        lam = torch.tensor([1.0, *(getattr(cfg, f"lam_{k}") for k in self.terms[1:])])
-        self.lam = nn.Buffer(lam, persistent=False)  # flags may change it
-        self.to(dev)
-        print(f"  {levels} levels, finest cell {octree.cell(levels - 1):.4f}; appearance {A} "
-              f"numbers; background {'a field' if has_field else 'one colour'}; mask {cfg.mask}")
+        self.octrees = [octree]
+        self.background = None
+        self.bg_color = constant(*raw["bg_color"].tolist()).float()
+        if is_on(cfg.background, bool(np.isnan(raw["bg_color"]).any())):
+            self.background = Background(scene.points[~is_inside], cfg.hidden, 9 + A)
+            self.octrees.append(self.background.octree)
+        self.deviation = Deviation()
+        self.mask = TransientMask(scene)
+        self.cache = SDFCache(min(max(16 * 2 ** (levels - 1), 64), 128))
+        print(f"  {levels} levels, appearance code of {A}, {len(self.octrees)} octrees")
 
     @property
-    def eps(self) -> float:
+    def eps(self):
         """Length of the taps of finite differences: half of the finest cell there is."""
-        return self.sdf.octree.cell(self.sdf.octree.active - 1) / 2
+        octree = self.sdf.octree
+        return octree.side(octree.finest) / 2
 
-    def distance(self, x: Tensor) -> Tensor:
+    def distance(self, x):
         """s (P,) at x (P,3)."""
         return self.sdf(x)[0]
 
-    def losses(self, rays: Rays, pick: Tensor, step: int, gen: torch.Generator):
-        """The objective, Eq. 5: its weighted sum, and the raw terms by name. M is what the network
-        said of each photo of pick (B,) at its last lesson; now and then comes another [D14]."""
-        cfg, R, n = self.cfg, len(rays.o), len(rays.o) // 2
-        self.deviation.bound(step, 32 * cfg.samples)  # about 1 / the finest section [D15]
-        if step % 8 == 0:  # an eighth of the cache
+    def losses(self, rays, photos, step, gen):
+        """The objective, Eq. 5, of rays that come photo by photo, equally many of each of photos
+        (B,). Returns the weighted sum; the raw terms by name; what `observe` learns from."""
+        cfg = self.cfg
+        R = len(rays.o)
+        code = self.appearance(photos).repeat_interleave(R // len(photos), 0)  # (R,A)
+        jitter = uniform(gen, R, cfg.samples + cfg.bg_samples)
+        out = render_rays(self, rays, code, jitter)
+        residual = (out["rgb"] - rays.rgb).abs()  # (R,3)
+
+        error = residual.detach().amax(1)  # (R,) of the worst channel
+        is_static = self.mask.is_static(rays)  # (R,)
+        detail = complexity(out["e_grad"], out["e_curv"]).detach()  # (R,)
+        phi = self.mask.phi(detail, out["opacity"].detach())  # (R,)
+        mask = torch.zeros_like(error)
+        l_mask = 0.0
+        if cfg.mask != "off":
+            logit = sample_logits(self.mask.logits(photos), rays.uv)  # (R,)
+            mask = logit.detach().sigmoid()
+            price = self.mask.price(phi, cfg.lam_mask, cfg.lam_gpl)
+            l_mask = transient_loss(logit, error * ~is_static, price)
+
+        which = (uniform(gen, R, 1) * (cfg.samples + 1)).long()
+        x = rays.at(out["t"].gather(1, which))[:, 0]  # (R,3) a random sample of each ray [D13]
+        taps = (x[:, None] + self.eps * self.sdf.taps).flatten(0, 1)  # (5R,3)
+        cube = 2 * uniform(gen, R // 2, 3) - 1
+        sfm = self.sfm[(uniform(gen, R // 2) * len(self.sfm)).long()]
+        s = self.distance(torch.cat([taps, cube, sfm]))
+        s_taps, s_cube, s_sfm = s.split([5 * R, R // 2, R // 2])
+        grad, _ = finite_differences(s_taps.reshape(R, 5), self.sdf.taps, self.eps)
+        e_grad = (out["e_grad"] + (grad.norm(dim=1) - 1) ** 2) / 2  # (R,)
+        pull = self.deviation().detach().clamp(max=40)  # [D10]
+
+        terms = dict(
+            rgb=((1 - mask) * residual.mean(1)).mean(),
+            eik=(out["is_inside"] * e_grad).mean(),
+            curv=out["e_curv"].mean(),  # [D4]
+            lps=lipschitz_loss(self.color),
+            off=torch.exp(-50 * s_cube.abs()).mean(),
+            sfm=pull * s_sfm.abs().mean(),
+            mask=mask.mean(),
+            gpl=gpl_loss(mask, phi))
+        total = (
+            terms["rgb"]
+            + cfg.lam_eik * terms["eik"]
+            + cfg.lam_curv * terms["curv"]
+            + cfg.lam_lps * terms["lps"]
+            + cfg.lam_off * terms["off"]
+            + cfg.lam_sfm * terms["sfm"]
+            + l_mask)  # lam_mask and lam_gpl are in its price
+        out |= dict(error=error, mask=mask, is_static=is_static, detail=detail)
+        return total, terms, out
+
+    def before_step(self, step, done):
+        """Keeps zeta within its bounds and an eighth of the cache up to date. done: 0..1."""
+        self.deviation.bound(done, most=32 * self.cfg.samples)  # about 1 / the finest section
+        if step % 8 == 0:
             self.cache.refresh(self.distance, step // 8 % 8, 8)
-        jitter = torch.rand(R, cfg.samples + cfg.bg_samples, generator=gen, device=gen.device)
-        out = render_rays(self, rays, self.appearance(rays.img), jitter)
-        residual = out["rgb"] - rays.rgb  # (R,3)
-        is_on = cfg.mask != "off"
-        mask = mask_at(self.mask.logits[pick], rays.uv) if is_on else torch.zeros_like(rays.near)
-        kept = (1 - mask) * residual.abs().mean(1)  # (R,) what the mask leaves of the L1 error
-        sfm = self.sfm[torch.randint(len(self.sfm), (n,), generator=gen, device=gen.device)]
-        cube = torch.empty(n, 3, device=gen.device).uniform_(-1, 1, generator=gen)
-        x = torch.cat([taps(out["x"], self.eps).reshape(-1, 3), cube, sfm])
-        ends, off, sfm = self.distance(x).split([5 * R, n, n])  # all points but the samples
-        lap = finite_differences(ends.reshape(R, 5), self.eps)[1]  # (R,) where rays end
-        e_curv = lap.abs() * self.eps * out["opacity"]  # (R,) opacity: no gradient [D4] [D13]
-        terms = dict(rgb=kept.mean(),
-                     eik=out["eikonal"].mean(),
-                     curv=e_curv.mean(),
-                     lps=torch.log(self.color.bounds()).sum(),  # [D5]
-                     off=torch.exp(-50 * off.abs()).mean(),
-                     sfm=self.deviation().detach().clamp(max=40) * sfm.abs().mean())  # [D10]
-        total = torch.stack([terms[name] for name in self.terms]) @ self.lam
-        with torch.no_grad():  # what refining and the mask will want to know
-            pixel = out["depth"] / self.scene.K[rays.img, 0]  # (R,) its size at the ray's end
-            hits = torch.cat([out["x"], kept[:, None], pixel[:, None]], 1)  # (R,5)
-            first = step * R % len(self.hits)
-            self.hits[first:first + R] = hits.nan_to_num(2, 2, 2)
-            bend = torch.add(LAM_GRAD * out["e_grad"], e_curv, alpha=LAM_LAP)  # (R,) [D3]
-            self.mask.remember(rays, residual, bend, out["opacity"])
-        if is_on and step % MASK_EVERY == 0:
-            self.mask.calibrate(bend, 0.2 if cfg.gpl == "calibrated" else 0.0)
-            taught, terms["gpl"] = self.mask.objective(pick)  # all terms of M in Eq. 5
-            total = total + taught
-        return total, terms | dict(mask=mask)
 
-    def batch(self, photos: Tensor, n: int, gen: torch.Generator) -> tuple[Rays, Tensor]:
-        """n rays of one step and the photos (B,) they come from, drawn at random."""
-        B, wh, dev = self.cfg.photos, self.scene.wh, photos.device
-        pick = photos[torch.randint(len(photos), (B,), generator=gen, device=dev)]  # (B,)
-        img = pick.repeat_interleave(max(n // B, 1))  # (R,) photo by photo, equally many from each
-        u = torch.rand(len(img), generator=gen, device=dev, dtype=torch.float64)  # (R,)
-        return make_rays(self.scene, img, (u * wh[img].prod(1)).long()), pick
+    @torch.no_grad()
+    def observe(self, rays, out):
+        """Remembers what refining and the mask's prices depend on."""
+        memory = self.mask
+        is_solid = out["opacity"] > 0.5  # (R,)
+        follow_quantiles(memory.complexity, memory.quantiles, out["detail"], is_solid)
+        follow_quantiles(memory.sfm_error, memory.quantiles[1:2], out["error"], out["is_static"])
+        pixel = out["depth"] / self.scene.K[rays.img, 0]  # (R,) its size at the ray's end
+        error = (1 - out["mask"]) * out["error"]
+        self.sdf.octree.record(out["end"], error, pixel, is_solid.float())
 
-    def groups(self) -> list[dict]:
-        """Optimiser groups: networks, lookup tables, which learn faster, zeta, and the mask. zeta's
-        larger eps keeps vanishing gradients from driving it away."""
-        tables = [self.appearance.weight, *(o.features for o in self.octrees)]
-        mask, v = list(self.mask.parameters()), self.deviation.v
-        taken = {*map(id, (*tables, *mask, v))}
-        nets = [p for p in self.parameters() if id(p) not in taken]
-        return [dict(params=nets, lr=self.cfg.lr_net), dict(params=tables, lr=self.cfg.lr_grid),
-                dict(params=[v], lr=self.cfg.lr_zeta, eps=1e-8),
-                dict(params=mask, lr=8e-3)]  # learns in few steps [D14]
+    def batch(self, photos, n, gen):
+        """n random rays and the photos (B,) they come from, photo by photo."""
+        which = (uniform(gen, self.cfg.photos) * len(photos)).long()
+        picked = photos[which]  # (B,)
+        img = picked.repeat_interleave(n // len(picked))  # (R,)
+        return random_rays(self.scene, img, gen), picked
 
-    def start(self, gen: torch.Generator, steps: int = 200, radius: float = 0.25) -> None:
+    def groups(self):
+        """Optimiser groups: networks; lookup tables, which learn faster; zeta, whose larger eps
+        keeps vanishing gradients from driving it away; the mask."""
+        tables = [self.appearance.weight] + [octree.features for octree in self.octrees]
+        mask = list(self.mask.parameters())
+        zeta = [self.deviation.v]
+        special = {id(p) for p in tables + mask + zeta}
+        networks = [p for p in self.parameters() if id(p) not in special]
+        return [
+            dict(params=networks, lr=self.cfg.lr_net),
+            dict(params=tables, lr=self.cfg.lr_grid),
+            dict(params=zeta, lr=1e-3, eps=1e-8),
+            dict(params=mask, lr=8e-3)]
+
+    def start(self, gen, steps=200, radius=0.25):
         """Warm-up: L_sphere fits the SDF to a sphere. A small one: a surface that starts inside the
         landmark grows to it, one that starts outside also has to be carved out of the sky."""
-        grid, *nets = self.sdf.parameters()
-        adam = torch.optim.Adam([dict(params=[grid], lr=1e-3), dict(params=nets)], 5e-3, fused=True)
+        grid, *networks = self.sdf.parameters()
+        adam = torch.optim.Adam([dict(params=[grid], lr=1e-3), dict(params=networks, lr=5e-3)])
         for _ in range(steps):
-            x = torch.empty(1024, 3, device=gen.device).uniform_(-1, 1, generator=gen)  # (P,3)
-            loss = ((self.distance(x) - (x.norm(dim=1) - radius)) ** 2).mean()
+            x = 2 * uniform(gen, 1024, 3) - 1  # (P,3)
+            sphere = x.norm(dim=1) - radius
+            loss = ((self.distance(x) - sphere) ** 2).mean()
             adam.zero_grad()
             loss.backward()
             adam.step()
         self.cache.refresh(self.distance)
 
+    def refine(self, optimizer):
+        """Splits and merges cells; Adam's moments move along with their features. [D15]"""
+        octree = self.sdf.octree
+        keys = refined_keys(octree, self.distance, self.deviation().item())
+        state = optimizer.state.pop(octree.features)
+        old_row = octree.build(from_first_process(keys))
+        for name in ("exp_avg", "exp_avg_sq"):
+            state[name] = carry_rows(state[name], old_row)
+        optimizer.state[octree.features] = state
+        for group, fresh in zip(optimizer.param_groups, self.groups()):
+            group["params"] = fresh["params"]
+
     @torch.no_grad()
-    def plan(self, is_last: bool) -> dict:
-        """How to fit the model to the scene: split keys; if is_last, whether it needs a mask."""
-        cfg, octree, mask = self.cfg, self.sdf.octree, self.cfg.mask
-        keys = octree.split_keys if cfg.grid == "uniform" else refined_keys(
-            octree, self.distance, self.hits, float(self.deviation()), cfg.max_mb)
-        if is_last and mask == "auto":
-            logits = self.mask.logits[self.scene.photos(False)]  # (B,1,m,m)
-            share = logits[logits != -9].sigmoid().mean().item()  # of photos that it has seen
-            mask = "on" if share > 0.01 else "off"  # [D16]
-            print(f"  mean mask {share:.4f}: mask {mask}")
-        return dict(keys=keys.cpu(), mask=mask)
+    def decide_mask(self):
+        """--mask auto: off if M marks hardly anything in the training photos. [D15]"""
+        if self.cfg.mask == "auto":
+            share = self.mask.share(self.scene.photos(False)).mean().item()
+            is_needed = from_first_process(share > 0.01)
+            self.cfg.mask = "on" if is_needed else "off"
+            print(f"  mean mask {share:.4f}: mask {self.cfg.mask}")
 
-    def follow(self, plan: dict, optimizer: torch.optim.Optimizer) -> None:
-        """Carries out a plan; Adam's moments move along with their features."""
-        octree, old, self.cfg.mask = self.sdf.octree, self.sdf.octree.features, plan["mask"]
-        old_row = octree.build(plan["keys"].to(old.device))
-        moments = optimizer.state.pop(old, {}).items()
-        optimizer.state[octree.features] = {k: v[old_row] if v.dim() else v for k, v in moments}
-        for group in optimizer.param_groups:
-            group["params"] = [octree.features if p is old else p for p in group["params"]]
-
-    def codes(self) -> Tensor:
+    def codes(self):
         """Appearance codes (I,A) of all photos."""
-        return self.appearance.weight
+        return self.appearance.weight.detach()
 
-    def render(self, rays: Rays, code: Tensor) -> dict[str, Tensor]:
+    def render(self, rays, code):
         """render_rays without jitter, for pictures and for fitting codes."""
-        shape = len(rays.o), self.cfg.samples + self.cfg.bg_samples  # S and the background's
-        return render_rays(self, rays, code, rays.o.new_full(shape, 0.5))
+        draws = self.cfg.samples + self.cfg.bg_samples
+        return render_rays(self, rays, code, code.new_full((len(code), draws), 0.5))
 
 
 # ---- 8 Energy ------------------------------------------------------------------------------------
 
-def open_counter(device: torch.device, rapl: str = "/sys/class/powercap"):
+def open_counter(device, rapl="/sys/class/powercap"):
     """A function that reads joules: of a GPU through NVML (Volta and newer), whatever
     CUDA_VISIBLE_DEVICES says, or of a CPU's packages, where readable (often by root only)."""
     if device.type == "cuda":
         import pynvml
         pynvml.nvmlInit()
-        used = range(RANKS) if RANKS > 1 else [device]  # the first process speaks for all
-        gpus = [pynvml.nvmlDeviceGetHandleByUUID(
-            f"GPU-{torch.cuda.get_device_properties(gpu).uuid}") for gpu in used]
-        return lambda: sum(map(pynvml.nvmlDeviceGetTotalEnergyConsumption, gpus)) / 1e3  # mJ
-    packages = [p for p in Path(rapl).glob("intel-rapl:*")  # not their parts, nor the platform
-                if (p / "name").read_text().startswith("package")]
-    need(packages, f"no counter in {rapl}")
-    return lambda: sum(int((p / "energy_uj").read_text()) for p in packages) / 1e6
+        uuid = torch.cuda.get_device_properties(device).uuid
+        gpu = pynvml.nvmlDeviceGetHandleByUUID(f"GPU-{uuid}")
+        return lambda: pynvml.nvmlDeviceGetTotalEnergyConsumption(gpu) / 1e3  # mJ
+    if LOCAL_RANK > 0:
+        return lambda: 0.0  # a machine's first process counts its packages
+    packages = []  # not their parts, nor the platform
+    for domain in Path(rapl).glob("intel-rapl:*"):
+        if (domain / "name").read_text().startswith("package"):
+            packages.append(domain / "energy_uj")
+    check(packages, f"no counter in {rapl}")
+    return lambda: sum(int(package.read_text()) for package in packages) / 1e6
 
 
 class EnergyMeter:
     """Joules counted from tick to tick, on top of those given; None, never 0, from where on nothing
     counts. A counter that starts again from zero between two ticks loses what it counted there."""
-    def __init__(self, device: torch.device, joules: float | None = 0.0, counter=None):
-        self.device, self.joules, self.counter, self.last = device, joules, counter, None
-        self.source = {"cuda": "nvml"}.get(device.type, "rapl") + " counter, read every 5 s"
+    def __init__(self, device, joules=0.0):
+        self.device = device
+        self.joules = joules
+        self.counter = None
 
-    def tick(self) -> None:
-        """Adds what was spent since the last tick. A failing reading ends metering, not the run."""
-        if self.joules is None:
-            return
+    def tick(self):
+        """Adds what was spent since the last tick. A failing counter ends metering, not the run."""
         try:
-            self.counter = self.counter or open_counter(self.device)
+            if self.counter is None:
+                self.counter = open_counter(self.device)
+                self.last = self.counter()
             now = self.counter()
-            self.joules += max(0.0, now - (now if self.last is None else self.last))
+            self.joules += max(0.0, now - self.last)
             self.last = now
         except Exception as error:  # a package, a driver's answer or a permission is missing
-            print(f"  energy is null ({error}); a GPU's needs: pip install nvidia-ml-py")
+            if self.joules is not None:
+                print(f"  energy is null ({error}); a GPU's needs: pip install nvidia-ml-py")
             self.joules = None
 
 
 # ---- 9 Training ----------------------------------------------------------------------------------
 
 REFINE_AT = (0.1, 0.2, 0.3, 0.45, 0.6)  # shares of training at which the octree is refined
-PATIENCE = 20  # void steps (loss or gradient not finite) in a row that stop a run; seen every 20
+RESULTS = ("checkpoint.pt", "log.jsonl", "metrics.json", "panel.png", "mesh.ply", "film.mp4")
 # torchrun starts RANKS processes. Each draws its own rays, the gradients are averaged, the first
-# process decides, speaks and writes; so all hold the same weights, but each what its rays found.
-RANK, LOCAL_RANK, RANKS = (int(os.environ.get(name, default)) for name, default in (
-    ("RANK", 0), ("LOCAL_RANK", 0), ("WORLD_SIZE", 1)))
+# process decides, speaks and writes; so all hold the same weights.
+RANK = int(os.environ.get("RANK", 0))
+LOCAL_RANK = int(os.environ.get("LOCAL_RANK", 0))
+RANKS = int(os.environ.get("WORLD_SIZE", 1))
 
 
-def agreed(value):
+def from_first_process(value):
     """The value that the first process has, for all of them."""
     box = [value]
     if RANKS > 1:
@@ -949,162 +1074,183 @@ def agreed(value):
     return box[0]
 
 
-def training_step(model, optimizer, photos: Tensor, state: dict, progress: float, gen):
-    """One update; the learning rate rises for 20 steps, then follows a cosine down to 5 %. Returns
-    the raw terms of the loss, and 1 if a loss or gradient that is not finite made the step void.
-    Nothing in it asks the device for a value."""
-    rays, pick = model.batch(photos, model.cfg.rays // RANKS, gen)
-    loss, terms = model.losses(rays, pick, state["step"], gen)
+def sum_over_processes(value):
+    """None if one of them has none."""
+    values = [value]
+    if RANKS > 1:
+        values = [None] * RANKS
+        dist.all_gather_object(values, value)
+    return None if None in values else sum(values)
+
+
+def average_gradients(model):
+    grads = [p.grad for p in model.parameters() if p.grad is not None]
+    flat = nn.utils.parameters_to_vector(grads)
+    dist.all_reduce(flat)
+    nn.utils.vector_to_parameters(flat / RANKS, grads)
+
+
+def training_step(model, optimizer, photos, step, done, gen):
+    """One update; the learning rate rises for 20 steps, then follows a cosine down to 5 %. done:
+    share of training, 0..1. Returns the raw terms of the loss. Asks the device for no value."""
+    model.before_step(step, done)
+    rays, picked = model.batch(photos, model.cfg.rays // RANKS, gen)
+    loss, terms, out = model.losses(rays, picked, step, gen)
     optimizer.zero_grad()
     loss.backward()
-    grads = [p.grad for p in model.parameters() if p.grad is not None]
-    flat = nn.utils.parameters_to_vector([loss.detach()[None], *grads])
-    if RANKS > 1:  # their mean over the processes
-        dist.all_reduce(flat)
-        nn.utils.vector_to_parameters(flat[1:] / RANKS, grads)
-    is_void = (flat.sum() * 0).nan_to_num(1)  # 0 or 1, as NaN and infinity times 0 are NaN
-    optimizer.found_inf = is_void  # fused Adam leaves such a step out
-    factor = min(1, (state["step"] + 1) / 20) * (0.525 + 0.475 * math.cos(math.pi * progress))
-    for group, now in zip(optimizer.param_groups, model.groups()):
-        group["lr"] = factor * now["lr"]
+    if RANKS > 1:
+        average_gradients(model)
+    warm_up = min(1, (step + 1) / 20)
+    decay = 0.525 + 0.475 * math.cos(math.pi * done)
+    for group, full in zip(optimizer.param_groups, model.groups()):
+        group["lr"] = warm_up * decay * full["lr"]
     optimizer.step()
-    state["step"] += 1
-    return terms, is_void
+    model.observe(rays, out)
+    return terms
 
 
-def facts(model) -> list:
-    """What a checkpoint must share with the scene and settings that it is read for."""
-    raw, cfg = model.scene.raw, model.cfg
-    made = {k: v for k, v in model.scene.info.items() if k not in ("folder", "split")}  # may move
-    return [made, *(raw[k].tolist() for k in ("name", "is_test", "scale", "center")),
-            cfg.grid, cfg.gpl]
+def make_optimizer(model):
+    return torch.optim.Adam(model.groups(), **model.adam, fused=True)
 
 
-def save_checkpoint(path: Path, model, optimizer, gen, state: dict) -> None:
+def fingerprint(scene):
+    """What a checkpoint must share with the scene that it is read for."""
+    return [scene.raw[key].tolist() for key in ("name", "is_test", "scale", "center")]
+
+
+def save_checkpoint(path, model, optimizer, gen, state):
+    saved = dict(
+        config=asdict(model.cfg),
+        scene=fingerprint(model.scene),
+        octrees=[octree.split_keys for octree in model.octrees],
+        model=model.state_dict(),
+        optimizer=optimizer.state_dict(),
+        generator=gen.get_state(),
+        state=state)
     buffer = io.BytesIO()  # as torch.save calls a full disk a RuntimeError
-    torch.save(dict(config=asdict(model.cfg), model=model.state_dict(), rng=gen.get_state(),
-                    optimizer=optimizer.state_dict(), state=state, facts=facts(model),
-                    octrees=[o.split_keys for o in model.octrees]), buffer)
-    atomic_write(path, lambda tmp: tmp.write_bytes(buffer.getbuffer()))
+    torch.save(saved, buffer)
+    atomic_write(path, lambda part: part.write_bytes(buffer.getbuffer()))
 
 
-def read_checkpoint(path: Path, given: dict) -> tuple[dict, Config]:
+def read_checkpoint(path, given):
     """A checkpoint's dictionary, tensors and plain values, never code; and its settings, replaced
     by those given. Raises UserError."""
-    need(path.exists(), f"{path} does not exist: train first, without --resume or --render, or "
-         "name the run by the --data, --seed and --name that it was made with")
+    check(path.exists(), f"{path} does not exist: train first, without --resume or --render, or "
+          "name the run by the --data, --seed and --name that it was made with")
     try:
         data_prep.refuse_bomb(path)
-        saved = dict(torch.load(path, map_location="cpu", weights_only=True))
+        saved = torch.load(path, map_location="cpu", weights_only=True)
         cfg = Config(**saved["config"])
-        counts = map(dict(saved["state"]).get, ("step", "refined", "seconds", "dropped"))
-        need(min(counts) >= 0, "")
+        check(saved["state"]["step"] >= 0, "negative")
     except Exception as error:  # a damaged file can fail in any layer: zip, pickle, tensor storage
         raise UserError(f"{path} is damaged, too large for the memory or of another program "
                         f"({type(error).__name__}): train again under another --name") from None
     return saved, replace(cfg, **given)
 
 
-def restore(saved: dict, path: Path, model, gen=None) -> torch.optim.Adam:
-    """Puts a checkpoint's weights into a model, its state into gen; returns its optimiser."""
+def restore(saved, path, model, gen):
+    """Puts a checkpoint's weights into a model and its state into gen; returns its optimiser."""
     try:
-        need(saved["facts"] == facts(model), "another scene or split")
+        check(saved["scene"] == fingerprint(model.scene), "another scene or split")
         for octree, keys in zip(model.octrees, saved["octrees"], strict=True):
             octree.build(keys.to(octree.features.device))
         model.load_state_dict(saved["model"])
-        optimizer = torch.optim.Adam(model.groups(), **model.adam, fused=True)
+        optimizer = make_optimizer(model)
         optimizer.load_state_dict(saved["optimizer"])
-        if gen is not None:
-            gen.set_state(saved["rng"])
+        gen.set_state(saved["generator"])
         return optimizer
     except torch.OutOfMemoryError:
         raise
-    except (LookupError, ValueError, RuntimeError, TypeError, AttributeError, UserError) as error:
+    except Exception as error:  # as in read_checkpoint
         raise UserError(f"{path} does not fit this scene and these settings ({error!r:.90}): use "
                         "flags and kind of device as it was made with, or another --name") from None
 
 
-def train(cfg: Config, scene: Scene, run: Path, saved: dict | None = None, kind=GeoNVS):
+def train(cfg, scene, run, saved=None, kind=GeoNVS):
     """Trains until cfg.steps or cfg.minutes; writes log.jsonl and checkpoint.pt below run. saved: a
     checkpoint to go on from; kind: class of the model. Returns model and state."""
-    begin, path = time.perf_counter(), run / "checkpoint.pt"
     torch.set_flush_denormal(True)  # vanishing weights would otherwise slow a CPU down
     torch.manual_seed(cfg.seed)
     gen = torch.Generator(scene.c2w.device).manual_seed(cfg.seed)
-    state = dict(step=0, refined=0, seconds=0.0, dropped=0, joules=0.0)
-    state |= saved["state"] if saved else {}
-    model, meter, terms = kind(cfg, scene), EnergyMeter(scene.c2w.device, state["joules"]), {}
-    meter.tick()
-    if saved is None:  # nothing of a former run may be taken for this one's
-        for name in "checkpoint.pt log.jsonl metrics.json panel.png mesh.ply film.mp4".split():
+    with torch.device(gen.device):
+        model = kind(cfg, scene)
+    path = run / "checkpoint.pt"
+    if saved is None:
+        for name in RESULTS:  # nothing of a former run may be taken for this one's
             (run / name).unlink(missing_ok=True)
         model.start(gen)
-        optimizer = torch.optim.Adam(model.groups(), **model.adam, fused=True)
+        optimizer = make_optimizer(model)
+        state = dict(step=0, refined=0, seconds=0.0, joules=0.0)
     else:
         optimizer = restore(saved, path, model, gen)
-    for value in model.state_dict().values() if RANKS > 1 else ():
-        dist.broadcast(value, 0)
-    if RANK:
+        state = saved["state"]
+    if RANKS > 1:
+        for value in model.state_dict().values():
+            dist.broadcast(value, 0)
         gen.manual_seed(cfg.seed + RANK + RANKS * state["step"])  # own rays for each process
-    photos, begin, streak = scene.photos(False), begin - state["seconds"], 0  # void steps in a row
-    next_line, next_save = state["seconds"] + 5, state["seconds"] + 60
+    meter = EnergyMeter(gen.device, state["joules"] if RANK == 0 else 0.0)
+    meter.tick()
+    photos = scene.photos(False)
+    begin = time.perf_counter() - state["seconds"]
+    next_log = state["seconds"] + 5
+    next_save = state["seconds"] + 60
+    terms = {}
     while True:
-        seconds = agreed(time.perf_counter() - begin)
-        progress = seconds / (60 * cfg.minutes) if cfg.minutes else state["step"] / cfg.steps
-        has_diverged = state["step"] % PATIENCE == 0 and int(streak) >= PATIENCE
-        is_over = progress >= 1 or has_diverged
-        if is_over or seconds > next_line:
-            state["dropped"] = int(state["dropped"])  # waits for a GPU's queue
+        if RANKS == 1 or state["step"] % 16 == 0:  # processes agree on time now and then
+            state["seconds"] = from_first_process(time.perf_counter() - begin)
+        done = state["step"] / cfg.steps
+        if cfg.minutes > 0:
+            done = state["seconds"] / (60 * cfg.minutes)
+        if done >= 1 or state["seconds"] > next_log:
             meter.tick()
-            state |= dict(joules=meter.joules, energy_wh=meter.joules and meter.joules / 3600,
-                          source=None if meter.joules is None else meter.source,
-                          seconds=agreed(time.perf_counter() - begin))
-            RANK or report(model, run / "log.jsonl", progress, state, terms)
-            next_line = seconds + 5
-            if is_over or seconds > next_save:
-                RANK or save_checkpoint(path, model, optimizer, gen, state)
-                next_save = seconds + 60
-        if is_over:
-            break
-        terms, is_void = training_step(model, optimizer, photos, state, progress, gen)
-        state["dropped"], streak = state["dropped"] + is_void, (streak + 1) * is_void
-        due = sum(progress >= share for share in REFINE_AT)
-        if state["refined"] != due:  # or fewer: resumed with a larger budget
+            state["joules"] = sum_over_processes(meter.joules)
+            next_log = state["seconds"] + 5
+            if RANK == 0:
+                report(model, run / "log.jsonl", done, state, terms)
+            if RANK == 0 and (done >= 1 or state["seconds"] > next_save):
+                save_checkpoint(path, model, optimizer, gen, state)
+                next_save = state["seconds"] + 60
+        if done >= 1:
+            return model, state
+        terms = training_step(model, optimizer, photos, state["step"], done, gen)
+        state["step"] += 1
+        due = sum(done >= share for share in REFINE_AT)
+        if state["refined"] < due:
             state["refined"] = due
-            model.follow(agreed(RANK or model.plan(due == len(REFINE_AT))), optimizer)
-    need(not has_diverged, f"{int(streak)} steps in a row had no finite loss: mend poses, or try a "
-         f"third of the learning rates --lr_grid, --lr_net; {path} holds the last good weights")
-    return model, state
+            model.refine(optimizer)
+            if due == len(REFINE_AT):
+                model.decide_mask()
 
 
 @torch.no_grad()
-def report(model, path: Path, progress: float, state: dict, terms: dict) -> None:
-    """A line on the terminal and one in log.jsonl. psnr and opacity: of 1,024 fixed rays."""
+def report(model, path, done, state, terms):
+    """A line on the terminal and one in log.jsonl. psnr: of 1,024 fixed rays."""
+    is_sound = all(p.isfinite().all() for p in model.parameters())
+    check(is_sound, "the loss is no longer finite: mend poses, or try a third of the learning "
+          f"rates --lr_grid and --lr_net; checkpoint.pt beside {path} is from before")
     gen = torch.Generator(model.scene.c2w.device).manual_seed(0)
     rays, _ = model.batch(model.scene.photos(False), 1024, gen)
     out = model.render(rays, model.codes()[rays.img])
-    more = dict(zeta=model.deviation(), opacity=out["opacity"]) if hasattr(model, "sdf") else {}
-    line = {k: state[k] for k in ("step", "seconds", "dropped", "energy_wh")}
-    line |= {k: v.mean().item() for k, v in (terms | more).items()}
-    line["psnr"] = psnr(out["rgb"], rays.rgb)
-    rate = state["step"] * model.cfg.rays / state["seconds"]
-    left = state["seconds"] * max(0, 1 / max(progress, 1e-3) - 1) / 60
-    shown = "".join(f"  {k} {line[k]:.3g}" for k in ("psnr", "zeta", "mask") if k in line)
-    print(f"  step {state['step']:6d}{shown}  {rate:.0f} rays/s  {left:.1f} min left", flush=True)
-    line = {k: v if v is None or abs(v) < math.inf else None for k, v in line.items()}  # as in JSON
+    line = state | dict(psnr=psnr(out["rgb"], rays.rgb))
+    for key, value in terms.items():
+        line[key] = float(value)
     with open(path, "a") as file:
         file.write(json.dumps(line) + "\n")
+    left = state["seconds"] * max(0, 1 / max(done, 1e-3) - 1) / 60
+    print(f"  step {state['step']:6d}  psnr {line['psnr']:.2f}  {left:.1f} min left", flush=True)
 
 
 # ---- 10 Scoring, mesh, pictures ------------------------------------------------------------------
 
-def to_uint8(picture: np.ndarray) -> np.ndarray:
-    return (picture.clip(0, 1) * 255 + 0.5).astype(np.uint8)
+def to_uint8(picture):
+    """Numbers in 0..1, numpy or torch, as bytes in numpy."""
+    return (np.asarray(picture).clip(0, 1) * 255 + 0.5).astype(np.uint8)
 
 
-def psnr(a, b) -> float:
+def psnr(a, b):
     """Peak signal-to-noise ratio in dB of two pictures in 0..1, numpy or torch; at most 100."""
-    return -10 * math.log10(max(float(((a - b) ** 2).mean()), 1e-10))
+    error = float(((a - b) ** 2).mean())
+    return -10 * math.log10(max(error, 1e-10))
 
 
 def make_lpips(device):
@@ -1115,314 +1261,424 @@ def make_lpips(device):
     except Exception as error:  # not installed, or its weights cannot be fetched
         print(f"  lpips is null ({error}): pip install lpips, with a network for its weights")
         return None
-    as_batch = lambda p: torch.as_tensor(p).to(device, torch.float32).permute(2, 0, 1)[None]
-    return lambda *pair: net(*map(as_batch, pair), normalize=True).item()  # 0..1 to -1..1
+
+    def distance(*pictures):
+        batch = torch.as_tensor(np.stack(pictures), dtype=torch.float32, device=device)
+        return net(*batch.permute(0, 3, 1, 2).split(1), normalize=True).item()
+    return distance
 
 
-def fit_codes(model, scene: Scene, photos: Tensor, steps: int = 128, n: int = 0) -> Tensor:
+def fit_codes(model, scene, photos, steps=128, n=64):
     """Appearance codes (B,A) of unseen photos (B,): Adam on n random rays a step of each left half
-    (64, on a GPU 512) [D12], from the mean code of the training photos. The scene stays as is."""
-    gen, n = torch.Generator(scene.c2w.device).manual_seed(0), n or (512 if photos.is_cuda else 64)
-    codes = model.codes().detach()[~scene.is_test].mean(0).repeat(len(photos), 1)  # (B,A)
+    [D12], from the mean code of the training photos. The scene stays as it is."""
+    gen = torch.Generator(scene.c2w.device).manual_seed(0)
+    codes = model.codes()[~scene.is_test].mean(0).repeat(len(photos), 1)  # (B,A)
+    if codes.numel() == 0:
+        return codes
     adam = torch.optim.Adam([codes.requires_grad_()])
     img = photos.repeat_interleave(n)  # (Bn,)
-    size = torch.stack([scene.wh[img, 0] // 2, scene.wh[img, 1]], 1)  # (Bn,2) of left halves [D12]
-    model.requires_grad_(False)
-    for step in tell(range(steps if codes.numel() else 0), "fitting the light of held-out photos"):
+    for step in progress(range(steps), "fitting the light of held-out photos"):
         adam.param_groups[0]["lr"] = 0.1 * 0.1 ** (step / steps)
-        u = torch.rand(size.shape, generator=gen, device=gen.device, dtype=torch.float64)
-        col, row = (u * size).long().unbind(1)  # (Bn,)
-        rays = make_rays(scene, img, row * scene.wh[img, 0] + col)
-        loss = (model.render(rays, codes.repeat_interleave(n, 0))["rgb"] - rays.rgb).abs().mean()
-        adam.zero_grad()
-        loss.backward()
+        rays = random_rays(scene, img, gen, part=0.5)
+        out = model.render(rays, codes.repeat_interleave(n, 0))
+        loss = (out["rgb"] - rays.rgb).abs().mean()
+        codes.grad, = torch.autograd.grad(loss, codes)
         adam.step()
-    for p in model.parameters():
-        p.requires_grad_(p.numel() > 0)  # at 0 CUDA errs
     return codes.detach()
 
 
+def photo_rays(scene, photo):
+    """The rays of all pixels of a photo, row by row."""
+    w, h = scene.wh[photo].tolist()
+    pixel = torch.arange(w * h, device=scene.wh.device)
+    return make_rays(scene, torch.full_like(pixel, photo), pixel)
+
+
 @torch.no_grad()
-def render_photo(model, scene: Scene, photo: int, code: Tensor) -> dict[str, np.ndarray]:
-    """A photo's view under an appearance code (A,): arrays (H,W,...) by name of render_rays, and
-    `truth` (H,W,3)."""
-    (w, h), parts = scene.wh[photo].tolist(), []
-    size = CHUNK if scene.c2w.is_cuda else CHUNK // 8  # as in SDFCache.refresh
-    for pixel in torch.arange(w * h, device=scene.c2w.device).split(size):
-        rays = make_rays(scene, torch.full_like(pixel, photo), pixel)
-        out = model.render(rays, code.expand(len(pixel), -1)) | dict(truth=rays.rgb)
-        parts.append({k: v for k, v in out.items() if v[0].numel() in (1, 3)})  # not the samples'
-    return {k: torch.cat([p[k] for p in parts]).reshape(h, w, *v.shape[1:]).cpu().numpy()
-            for k, v in parts[0].items()}
+def render_photo(model, scene, photo, code):
+    """A photo's view under an appearance code (A,): rgb, truth and normal (H,W,3)."""
+    w, h = scene.wh[photo].tolist()
+    rays = photo_rays(scene, photo)
+    parts = []
+    for chosen in torch.arange(w * h, device=code.device).split(1024):
+        some = Rays(*[column[chosen] for column in rays])
+        out = model.render(some, code.expand(len(chosen), -1))
+        parts.append(torch.cat([out["rgb"], some.rgb, out["normal"]], 1))  # (R,9)
+    picture = torch.cat(parts).reshape(h, w, 9).cpu().numpy()
+    rgb, truth, normal = np.split(picture, 3, axis=2)
+    return dict(rgb=rgb, truth=truth, normal=normal)
 
 
-def score(frame: dict[str, np.ndarray], lpips=None) -> dict:
+def score(frame, lpips=None):
     """The right half of a rendered photo [D12] against the truth, both rounded to 8 bits, beside
     the trivial predictor: the mean colour of each row of the left half. SSIM: Gaussian window of
     11 px, sigma 1.5, no border. None where a picture is too small."""
-    half = frame["rgb"].shape[1] // 2
-    flat = np.broadcast_to(frame["truth"][:, :half].mean(1, keepdims=True), frame["truth"].shape)
-    got, want, flat = (to_uint8(p)[:, half:] / 255 for p in (frame["rgb"], frame["truth"], flat))
-    how = dict(channel_axis=2, data_range=1, gaussian_weights=True, sigma=1.5)
-    ssim, side = functools.partial(structural_similarity, **how), min(got.shape[:2])
-    return dict(psnr=psnr(got, want), psnr_floor=psnr(flat, want), ssim=None if side < 11 else
-                float(ssim(got, want, use_sample_covariance=False)),
-                lpips=lpips(got, want) if lpips and side >= 32 else None)
+    truth = frame["truth"]
+    half = truth.shape[1] // 2
+    want = to_uint8(truth[:, half:]) / 255
+    got = to_uint8(frame["rgb"][:, half:]) / 255
+    flat = to_uint8(truth[:, :half].mean(1, keepdims=True)) / 255
+    row = dict(psnr=psnr(got, want), psnr_floor=psnr(flat, want), ssim=None, lpips=None)
+    side = min(got.shape[:2])
+    if side >= 11:
+        ssim = structural_similarity(
+            got, want, channel_axis=2, data_range=1, gaussian_weights=True, sigma=1.5,
+            use_sample_covariance=False)
+        row["ssim"] = float(ssim)
+    if lpips and side >= 32:
+        row["lpips"] = lpips(got, want)
+    return row
 
 
-def evaluate(model, scene: Scene, lpips=None) -> dict:
+def evaluate(model, scene, lpips=None):
     """Scores of the test photos by the half-image protocol [D12], per photo and on average, None
-    where there are none; the first frames, (photo, name, frame), for the panel."""
-    photos, rows, frames, means = scene.photos(True), [], [], {}  # (B,)
-    codes = [code for some in photos.split(32) for code in fit_codes(model, scene, some)]  # B (A,)
-    for i, code in tell(list(zip(photos.tolist(), codes)), "scoring held-out photos"):
-        frame, name = render_photo(model, scene, i, code), str(scene.raw["name"][i])
+    where there are none; the first frames, (photo, title, frame), for the panel."""
+    photos = scene.photos(True)  # (B,)
+    codes = fit_codes(model, scene, photos)  # (B,A)
+    rows = []
+    frames = []
+    for photo, code in progress(list(zip(photos.tolist(), codes)), "scoring held-out photos"):
+        name = str(scene.raw["name"][photo])
+        frame = render_photo(model, scene, photo, code)
         rows.append(dict(name=name) | score(frame, lpips))
-        frames += [(i, f"held out: {name}", frame)] if len(frames) < 2 else []
+        frames.append((photo, f"held out: {name}", frame))
+    scores = dict(per_image=rows)
     for key in ("psnr", "psnr_floor", "ssim", "lpips"):
         values = [row[key] for row in rows if row[key] is not None]
-        means[key] = float(np.mean(values)) if values else None
-    return means | dict(per_image=rows, frames=frames)
+        scores[key] = float(np.mean(values)) if values else None
+    return scores, frames[:2]
 
 
 @torch.no_grad()
-def toy_truth(model, scene: Scene) -> dict:
-    """What only a toy can tell, from every fifth training pixel. sdf_error: mean |s - s_true|
-    within 0.05 of visible surfaces, scene units. mask_iou, mask_static: M > 0.5 against the true
-    occluders, and mean M on all others; None without a mask."""
-    raw, info, gen = scene.raw, scene.info, torch.Generator().manual_seed(0)
-    img = torch.arange(len(scene.wh), device=scene.wh.device).repeat_interleave(scene.start.diff())
-    pixel = torch.nonzero(~scene.is_test[img])[::5, 0]  # (R,)
-    rays = make_rays(scene, img[pixel], pixel - scene.start[img[pixel]])
-    depth = torch.as_tensor(raw["depth"]).to(rays.d)[pixel]  # (R,)
-    x = rays.at(depth[:, None])[depth.isfinite(), 0]  # (P,3)
-    x = x + 0.02 * torch.randn(x.shape, generator=gen).to(x)  # around the surface
-    x = x[x.norm(dim=1) < 1]
-    true = data_prep.toy_sdf(x.cpu().numpy() * raw["scale"] + raw["center"],
-                             info["background"], info["landmark"]) / raw["scale"]  # (P,)
-    s = torch.cat([model.distance(part) for part in x.split(CHUNK)]).cpu().numpy()  # (P,)
-    error = float(np.abs(s - true)[np.abs(true) < 0.05].mean())
-    if model.cfg.mask == "off":
-        return dict(sdf_error=error, mask_iou=None, mask_static=None)
-    mask = torch.cat([mask_at(model.mask.look(i), rays.uv[rays.img == i])
-                      for i in scene.photos(False)[:, None]]).cpu().numpy()  # (R,)
-    people, found = raw["occluder"][pixel.cpu()], mask > 0.5  # (R,)
-    iou = float((found & people).sum() / (found | people).sum()) if people.any() else None
-    return dict(sdf_error=error, mask_iou=iou, mask_static=float(mask[~people].mean()))
+def toy_truth(model, scene):
+    """What only a toy can tell, at training pixels. sdf_error: mean |s - s_true| within 0.05 of
+    visible surfaces, scene units; normal_error: median angle at walls, degrees, by taps of 0.004.
+    mask_iou, mask_static: M > 0.5 against the true occluders, and mean M on all others; None
+    without a mask."""
+    raw = scene.raw
+    walls = []
+    masks = []
+    people = []
+    for photo in scene.photos(False).tolist():
+        rays = photo_rays(scene, photo)
+        pixels = slice(*raw["start"][photo:photo + 2])
+        depth = torch.as_tensor(raw["depth"][pixels]).to(rays.d)  # (R,) infinite for the sky
+        walls.append(rays.at(depth[:, None])[:, 0])
+        masks.append(sample_logits(model.mask.logits([photo]), rays.uv).sigmoid())
+        people.append(raw["occluder"][pixels])
+    wall = torch.cat(walls)[::9]  # (P,3)
+    wall = wall[wall.norm(dim=1) < 0.95]
+
+    def true_sdf(x):  # (P,3) -> (P,)
+        world = x.cpu().numpy() * raw["scale"] + raw["center"]
+        s = data_prep.toy_sdf(world, scene.info["background"], scene.info["landmark"])
+        return torch.as_tensor(s / raw["scale"]).to(x)
+
+    gen = torch.Generator().manual_seed(0)
+    x = wall + 0.02 * torch.randn(wall.shape, generator=gen).to(wall)  # around the surface
+    true = true_sdf(x)
+    error = (in_chunks(model.distance, x) - true).abs()[true.abs() < 0.05]
+
+    eps = 0.004
+    taps = model.sdf.taps
+    ends = [true_sdf(wall + eps * tap) for tap in taps]
+    true, _ = finite_differences(torch.stack(ends, 1), taps, eps)
+    grad, _ = model.sdf.derivatives(wall, eps)
+    is_smooth = (true.norm(dim=1) - 1).abs() < 0.01  # not at edges
+    cos = F.cosine_similarity(grad, true)[is_smooth].clamp(-1, 1)
+    truth = dict(
+        sdf_error=error.mean().item(),
+        normal_error=cos.acos().rad2deg().median().item(),
+        mask_iou=None,
+        mask_static=None)
+    if model.cfg.mask != "off":
+        mask = torch.cat(masks).cpu().numpy()
+        people = np.concatenate(people)
+        found = mask > 0.5
+        truth["mask_static"] = float(mask[~people].mean())
+        if people.any():
+            truth["mask_iou"] = float((found & people).sum() / (found | people).sum())
+    return truth
 
 
 @torch.no_grad()
-def extract_mesh(model: GeoNVS, resolution: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """The surface s = 0 in the unit sphere, open where it meets that: vertices (N,3) in SfM units,
-    faces (M,3). By marching cubes over `resolution` cells (default: two per finest octree cell, at
-    most 512); corners near the surface are evaluated, elsewhere the cache has the sign."""
-    scene, cache = model.scene, model.cache.volume
-    n = resolution or min(round(2 / model.eps), 512)
-    line = torch.linspace(-1, 1, n + 1, device=cache.device)
+def extract_mesh(model):
+    """The surface s = 0 in the unit sphere, open where it meets that, by marching cubes with two
+    cells per finest octree cell, at most 512: vertices (N,3) in SfM units, faces (M,3), colours
+    (N,3) uint8 as seen along the normals under the mean code. Corners near the surface are
+    evaluated, elsewhere the cache has the sign."""
+    cache = model.cache.volume
+    n = min(round(2 / model.eps), 512)
     volume = F.interpolate(cache, size=(n + 1,) * 3, mode="trilinear", align_corners=True)[0, 0]
-    radius = (line[:, None, None] ** 2 + line[:, None] ** 2 + line ** 2).sqrt()  # (n+1,n+1,n+1)
-    near = torch.nonzero((volume.abs() < 6 / cache.shape[-1]) & (radius < 1))  # (P,3)
-    for index in tell(near.split(2 ** 16), "meshing"):
-        volume[tuple(index.T)] = model.distance(index * (2 / n) - 1.0)
+    index = grid_index(n + 1, cache.device)
+    radius = (index * (2 / n) - 1).norm(dim=1).reshape(volume.shape)
+    near = (volume.abs() < 6 / cache.shape[-1]) & (radius < 1)
+    volume[near] = in_chunks(model.distance, near.nonzero() * (2 / n) - 1)
     is_inside = radius < 1 - 4 / n  # so that all corners of the cells there are evaluated
-    if len(torch.unique(volume[is_inside] < 0)) < 2:
-        return np.zeros((0, 3)), np.zeros((0, 3), int)
+    if len((volume[is_inside] < 0).unique()) < 2:
+        return np.zeros((0, 3)), np.zeros((0, 3), int), np.zeros((0, 3), np.uint8)
     vertices, faces, _, _ = marching_cubes(volume.cpu().numpy(), 0, mask=is_inside.cpu().numpy())
-    return (vertices * (2 / n) - 1) * scene.raw["scale"] + scene.raw["center"], faces
+    x = torch.tensor(vertices * (2 / n) - 1, dtype=torch.float32, device=cache.device)
+    colors = in_chunks(lambda part: surface_color(model, part), x)
+    raw = model.scene.raw
+    return x.cpu().numpy() * raw["scale"] + raw["center"], faces, to_uint8(colors.cpu())
 
 
-def write_ply(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
+def surface_color(model, x):
+    """Colours (P,3) of surface points (P,3), seen along their normals under the mean code."""
+    grad, _ = model.sdf.derivatives(x, model.eps)
+    normal = F.normalize(grad)
+    code = model.codes()[~model.scene.is_test].mean(0).expand(len(x), -1)
+    _, geo = model.sdf(x)
+    inputs = torch.cat([geo, normal, direction_code(-normal), code], 1)
+    return mixed_precision(model.color, inputs).sigmoid()
+
+
+def write_ply(path, vertices, faces, colors):
     """Binary PLY; double, as coordinates of a map would lose their metres."""
-    f = np.empty(len(faces), [("n", "u1"), ("index", "<i4", 3)])
-    f["n"], f["index"] = 3, faces
-    header = ("ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}",
-              *[f"property double {k}" for k in "xyz"], f"element face {len(f)}",
-              "property list uchar int vertex_indices", "end_header\n")
-    data = "\n".join(header).encode() + vertices.astype("<f8").tobytes() + f.tobytes()
-    atomic_write(path, lambda tmp: tmp.write_bytes(data))
+    vertex = np.empty(len(vertices), [("x", "<f8", 3), ("color", "u1", 3)])
+    vertex["x"] = vertices
+    vertex["color"] = colors
+    face = np.empty(len(faces), [("count", "u1"), ("index", "<i4", 3)])
+    face["count"] = 3
+    face["index"] = faces
+    header = f"""ply
+format binary_little_endian 1.0
+element vertex {len(vertex)}
+property double x
+property double y
+property double z
+property uchar red
+property uchar green
+property uchar blue
+element face {len(face)}
+property list uchar int vertex_indices
+end_header
+"""
+    data = header.encode() + vertex.tobytes() + face.tobytes()
+    atomic_write(path, lambda part: part.write_bytes(data))
 
 
-def panel(model, frames: list[tuple[int, str, dict]], width: int = 240) -> np.ndarray:
-    """A row for each photo, (number, name, rendered frame): photo, render, and of our model the
-    normals of the surface and what the mask network says of the photo."""
+def write_panel(path, model, frames, width=240):
+    """A row for each (photo, title, frame): photo, render, and of our model the normals of the
+    surface and what the mask network says of the photo."""
     rows = []
-    for i, name, f in frames:
-        tiles = {name: f["truth"], "render": f["rgb"]}
-        if hasattr(model, "sdf"):
-            tiles["normals"] = f["normal"] / 2 + 0.5
-        if hasattr(model, "sdf") and model.cfg.mask != "off":
-            M = to_uint8(model.mask.look([i])[0, 0].sigmoid().detach().cpu().numpy())  # (m,m)
-            M = cv2.applyColorMap(M, cv2.COLORMAP_VIRIDIS)[:, :, ::-1] / 255  # (m,m,3)
-            tiles["mask: yellow is transient"] = M
-        size = width, round(width * f["rgb"].shape[0] / f["rgb"].shape[1])
-        row = [np.pad(cv2.resize(to_uint8(tile), size, interpolation=cv2.INTER_AREA),
-                      ((20, 4), (0, 4), (0, 0)), constant_values=255) for tile in tiles.values()]
-        for title, tile in zip(tiles, row):
-            cv2.putText(tile, title, (2, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.4, (0, 0, 0), 1, 16)
+    for photo, title, frame in frames:
+        tiles = {title: frame["truth"], "render": frame["rgb"]}
+        if isinstance(model, GeoNVS):
+            tiles["normals"] = frame["normal"] / 2 + 0.5
+            M = model.mask.logits([photo])[0, 0].sigmoid().detach()  # (m,m)
+            colors = cv2.applyColorMap(to_uint8(M.cpu()), cv2.COLORMAP_VIRIDIS)
+            tiles["mask: yellow is transient"] = colors[:, :, ::-1] / 255
+        h, w = frame["rgb"].shape[:2]
+        row = []
+        for text, tile in tiles.items():
+            tile = cv2.resize(to_uint8(tile), (width, width * h // w), interpolation=cv2.INTER_AREA)
+            tile = np.pad(tile, ((20, 4), (0, 4), (0, 0)), constant_values=255)
+            cv2.putText(tile, text, (2, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.4, (0, 0, 0), 1, 16)
+            row.append(tile)
         rows.append(np.concatenate(row, 1))
-    return np.concatenate(rows)
+    picture = np.concatenate(rows)[:, :, ::-1]
+    atomic_write(path, lambda part: cv2.imwrite(str(part), picture))
 
 
-def finish(model, scene: Scene, state: dict, run: Path) -> dict:
+def finish(model, scene, state, run):
     """Scores a trained model and writes metrics.json, panel.png and mesh.ply below run."""
-    cfg, is_gpu, octrees = model.cfg, scene.c2w.is_cuda, model.octrees
-    peak = (torch.cuda.max_memory_allocated(scene.c2w.device) if is_gpu else  # before scoring
-            resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-            * (1 if sys.platform == "darwin" else 1024))
-    scores = evaluate(model, scene, make_lpips(scene.c2w.device))
-    frames = scores.pop("frames")
-    if hasattr(model, "sdf"):
+    cfg = model.cfg
+    device = scene.c2w.device
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024  # before scoring
+    machine = f"cpu, {torch.get_num_threads()} threads"
+    if device.type == "cuda":
+        peak = torch.cuda.max_memory_allocated(device)
+        machine = torch.cuda.get_device_name(device)
+    scores, frames = evaluate(model, scene, make_lpips(device))
+    if isinstance(model, GeoNVS):
         write_ply(run / "mesh.ply", *extract_mesh(model))
-        scores |= toy_truth(model, scene) if scene.info["kind"] == "toy" else {}
-        busy = scene.photos(False)
-        share = model.mask.logits[busy].sigmoid().mean((1, 2, 3))
-        busy = busy[share.argsort(descending=True)][:2].tolist()  # with most on the mask
-        frames = [(i, f"training: {scene.raw['name'][i]}",
-                   render_photo(model, scene, i, model.codes()[i])) for i in busy] + frames
-    picture = panel(model, frames)[:, :, ::-1]
-    atomic_write(run / "panel.png", lambda tmp: cv2.imwrite(str(tmp), picture))
+        if scene.info["kind"] == "toy":
+            scores |= toy_truth(model, scene)
+        photos = scene.photos(False)
+        with torch.no_grad():
+            order = model.mask.share(photos).argsort(descending=True)
+        for photo in photos[order[:2]].tolist():  # with most on the mask
+            frame = render_photo(model, scene, photo, model.codes()[photo])
+            frames.append((photo, f"training: {scene.raw['name'][photo]}", frame))
+    write_panel(run / "panel.png", model, frames)
     parameters = sum(p.numel() for p in model.parameters())
-    git = "git", "-C", Path(__file__).parent, "describe", "--always", "--dirty", "--exclude=*"
-    metrics = dict(
-        scene=scene.info["scene"], method=model.name, seed=cfg.seed, steps=state["step"],
-        device=(torch.cuda.get_device_name(scene.c2w.device) if is_gpu else
-                f"cpu, {torch.get_num_threads()} threads"), **scores,
-        train_seconds=state["seconds"], dropped=state["dropped"],
-        energy_wh=state["energy_wh"], energy_source=state["source"],
+    cells = [octree.cells[:, 0].bincount().tolist() for octree in model.octrees]  # by level
+    here = Path(__file__).parent
+    status, commit = subprocess.getstatusoutput(f'git -C "{here}" describe --always --dirty')
+    metrics = scores | dict(
+        scene=scene.info["scene"],
+        method=model.name,
+        seed=cfg.seed,
+        steps=state["step"],
+        device=machine,
+        train_seconds=state["seconds"],
+        energy_wh=state["joules"] and state["joules"] / 3600,
+        energy_source=state["joules"] and "the device's counter, read every 5 s",
         rays_per_second=state["step"] * cfg.rays / max(state["seconds"], 1e-9),
-        octree_cells=octrees and octrees[0].cells[:, 0].bincount().tolist() or None,
-        model_bytes=4 * parameters + sum(4 * (o.child.numel() + o.corner.numel()) for o in octrees),
-        peak_memory_bytes=peak, parameters=parameters, torch=torch.__version__, config=asdict(cfg),
+        octree_cells=cells[0] if cells else None,
+        parameters=parameters,
+        model_bytes=4 * parameters + 44 * sum(map(sum, cells)),  # a cell: child, 8 corners, 8 flags
+        peak_memory_bytes=peak,
         protocol="appearance fitted on the left half, scored on the right half",
-        commit=shutil.which("git") and subprocess.run(
-            git, capture_output=True, text=True).stdout.strip() or None)
-    atomic_write(run / "metrics.json", lambda tmp: tmp.write_text(json.dumps(metrics, indent=1)))
+        torch=torch.__version__,
+        commit=None if status else commit,
+        config=asdict(cfg))
+    atomic_write(run / "metrics.json", lambda part: part.write_text(json.dumps(metrics, indent=1)))
     return metrics
 
 
-def film(model, scene: Scene, path: Path, rays: float = 4e6) -> None:
-    """mp4 at 24 frames/s: a path through the training cameras, from one end to the other, then one
-    view through the photos' lights. Frames are as large as photos, or as so many rays allow."""
-    photos = scene.photos(False)
-    c2w, codes = scene.c2w[photos], model.codes()[photos]
-    between = lambda keys: F.interpolate(keys.T[None], 48, mode="linear", align_corners=True)[0].T
-    place = c2w[:, :, 3] - c2w[:, :, 3].mean(0)  # (B,3)
-    order = (place @ torch.linalg.svd(place)[2][0]).argsort()  # along the axis of their spread
-    stops = order[torch.linspace(0, len(order) - 1, min(7, len(order))).round().long()]
-    poses = between(c2w[stops].flatten(1)).reshape(-1, 3, 4)  # (48,3,4)
-    left, _, right = torch.linalg.svd(poses[:, :, :3])
-    poses[:, :, :3] = left @ right  # the nearest rotation
-    view = order[len(order) // 2]  # the middle camera
-    shots = [(pose, codes.mean(0)) for pose in poses]
-    shots += [(c2w[view], code) for code in between(codes)] if codes.numel() else []
-    wh, K = (a[photos[view]][None] for a in (scene.wh, scene.K))
-    near = scene.near[photos].min()[None]  # as cameras between the photos may be nearer
-    budget = rays * (50 if wh.is_cuda else 1) / len(shots)
-    scale = min(1.0, math.sqrt(budget / wh.prod().item()))
-    one = scene._replace(wh=(wh * scale / 2).long() * 2, K=K * scale, near=near)  # even sides
+def in_between(keys, n=48):
+    """n rows (n,D) evenly along the polyline through keys (B,D)."""
+    return F.interpolate(keys.T[None], n, mode="linear", align_corners=True)[0].T
 
-    def write(tmp):
-        video = cv2.VideoWriter(str(tmp), cv2.VideoWriter_fourcc(*"mp4v"), 24, one.wh[0].tolist())
-        need(video.isOpened(), "OpenCV cannot write mp4 here")
-        for pose, code in tell(shots, f"filming {len(shots)} frames"):
-            frame = render_photo(model, one._replace(c2w=pose[None]), 0, code)["rgb"]
-            video.write(np.ascontiguousarray(to_uint8(frame)[:, :, ::-1]))
-        video.release()  # without a word where the disk is full
-        return cv2.VideoCapture(str(tmp)).get(cv2.CAP_PROP_FRAME_COUNT) == len(shots)
+
+def film(model, scene, path, pixels=40_000):
+    """mp4 at 24 frames/s: a path through the training cameras, from one end to the other, then one
+    view through the photos' lights. Frames are as large as photos, or have so many pixels."""
+    photos = scene.photos(False)
+    centre = scene.c2w[photos, :, 3]  # (B,3)
+    axis = centre.std(0).argmax()  # along which cameras spread most
+    photos = photos[centre[:, axis].argsort()]
+    stops = photos[::math.ceil(len(photos) / 7)]
+    path_c2w = in_between(scene.c2w[stops].flatten(1)).reshape(-1, 3, 4)
+    left, _, right = torch.linalg.svd(path_c2w[:, :, :3])
+    left[:, :, 2] *= torch.linalg.det(left @ right)[:, None]
+    path_c2w[:, :, :3] = left @ right  # the nearest rotation
+    codes = model.codes()[photos]
+    view = photos[len(photos) // 2]
+    shots = [(c2w, codes.mean(0)) for c2w in path_c2w]
+    shots += [(scene.c2w[view], code) for code in in_between(codes)] if codes.numel() else []
+    scale = (pixels / scene.wh[view].prod()).sqrt().clamp(max=1)
+    one = scene._replace(
+        wh=(scene.wh[view] * scale / 2).long()[None] * 2,  # even sides
+        K=scene.K[view][None] * scale,
+        near=scene.near[photos].min()[None])  # as cameras between the photos may be nearer
+
+    def write(part):
+        codec = cv2.VideoWriter_fourcc(*"mp4v")
+        video = cv2.VideoWriter(str(part), codec, 24, one.wh[0].tolist())
+        check(video.isOpened(), "OpenCV cannot write mp4 here")
+        for c2w, code in progress(shots, f"filming {len(shots)} frames"):
+            frame = render_photo(model, one._replace(c2w=c2w[None]), 0, code)
+            video.write(to_uint8(frame["rgb"][:, :, ::-1]))
+        video.release()
+        return part.stat().st_size > 0
     atomic_write(path, write)
     print(f"wrote {path}")
 
 
 # ---- 11 Command line -----------------------------------------------------------------------------
 
-def make_parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0], allow_abbrev=False,
-                                     argument_default=argparse.SUPPRESS,
-                                     epilog=f"[Dn]: see geonvs.py's head. Photos on a GPU: {LARGE}")
-    parser.error = lambda message: need(False, f"{message}: see python geonvs.py --help")
-    for f in fields(Config):
-        parser.add_argument(f"--{f.name}", type=type(f.default), choices=f.metadata["choices"],
-                            help=f"{f.metadata['help']} [{f.default}]")
+class Parser(argparse.ArgumentParser):
+    def error(self, message):
+        raise UserError(f"{message}: see --help")
+
+
+def make_parser():
+    parser = Parser(
+        description=__doc__.split("\n\n")[0],
+        epilog=f"[Dn]: see geonvs.py's head. Photos on a GPU: {LARGE}",
+        allow_abbrev=False,
+        argument_default=argparse.SUPPRESS)
+    for setting in fields(Config):
+        parser.add_argument(
+            f"--{setting.name}",
+            type=setting.type,
+            choices=setting.metadata["choices"],
+            help=f"{setting.metadata['help']} [{setting.default}]")
     parser.add_argument("--resume", action="store_true", help="go on from the run's checkpoint")
-    parser.add_argument("--render", action="store_true", help="film a finished run: a path through "
-                        "the cameras, then one view through the lights of the photos")
+    parser.add_argument("--render", action="store_true", help="film a finished run")
     return parser
 
 
-def pick_device(name: str) -> torch.device:
+def pick_device(name):
     """The device of this process: with torchrun each has its own GPU."""
-    names = ["cpu", *(f"cuda:{i}" for i in range(torch.cuda.device_count()))]
-    chosen = ("cuda" if names[1:] else "cpu") if name == "auto" else name
-    if chosen == "cuda" or RANKS > 1 and chosen in names[1:]:
-        chosen = f"cuda:{LOCAL_RANK}"
-    need(chosen in names, f"--device {name} is not there: this machine has {', '.join(names)}")
-    return torch.device(chosen)
+    there = ["cpu"] + [f"cuda:{i}" for i in range(torch.cuda.device_count())]
+    if name == "auto":
+        name = "cuda" if len(there) > 1 else "cpu"
+    if name == "cuda":
+        name = f"cuda:{LOCAL_RANK}"
+    check(name in there, f"--device {name} is not there: this machine has {', '.join(there)}")
+    return torch.device(name)
 
 
-def make_config(given: dict) -> Config:
+def make_config(given):
     """Config's defaults, then LARGE if photos meet a GPU, then flags."""
     is_toy = not given.get("data") and given.get("scene", "toy") == "toy"
     has_gpu = given.get("device") != "cpu" and torch.cuda.device_count() > 0
-    return Config(**(LARGE if has_gpu and not is_toy else {}) | given)
+    large = LARGE if has_gpu and not is_toy else {}
+    return Config(**(large | given))
 
 
-def execute(cfg: Config, scene: Scene, run: Path, saved: dict | None = None, kind=GeoNVS) -> dict:
-    """Trains and scores one model; returns its metrics."""
+def execute(cfg, scene, run, saved=None, kind=GeoNVS):
+    """Trains and scores one model; returns its metrics, in the first process."""
     run.mkdir(parents=True, exist_ok=True)
-    print(f"{kind.name} on {scene.info['scene']}: {len(scene.wh)} photos ({len(scene.photos(True))}"
-          f" held out), {len(scene.rgb):,} pixels; {scene.c2w.device}; {run}/")
+    print(f"{kind.name} on {scene.info['scene']}: {len(scene.wh)} photos, "
+          f"{len(scene.photos(True))} held out; {scene.c2w.device}; {run}/")
     model, state = train(cfg, scene, run, saved, kind)
-    metrics = agreed(RANK or finish(model, scene, state, run))
-    print("".join(f"  {k} {v:.4g}" for k, v in metrics.items() if isinstance(v, float)))
-    return metrics
+    if RANK == 0:
+        metrics = finish(model, scene, state, run)
+        numbers = [f"{k} {v:.4g}" for k, v in metrics.items() if isinstance(v, float)]
+        print(" ", "  ".join(numbers))
+        return metrics
 
 
-def main(argv: list[str] | None = None) -> None:
-    given, saved = vars(make_parser().parse_args(argv)), None
-    resume, render = (given.pop(k, False) for k in ("resume", "render"))
-    finding = ("scene", "data", "name", "seed") if resume or render else given  # a run's folder
-    cfg = make_config({k: v for k, v in given.items() if k in finding})
-    where = data_prep.scene_path(cfg.source).stem
-    run = Path("runs") / (cfg.name or f"{where}-{GeoNVS.name}-{cfg.seed}")
+def start_processes(device):
+    """Joins the processes that torchrun started; the first one speaks."""
+    check("MASTER_ADDR" in os.environ, "start processes by torchrun, or unset WORLD_SIZE")
+    dist.init_process_group("cpu:gloo,cuda:nccl" if device.type == "cuda" else "gloo")
+    if RANK > 0:
+        sys.stdout = open(os.devnull, "w")
+
+
+def main(argv=None):
+    given = vars(make_parser().parse_args(argv))
+    resume = given.pop("resume", False)
+    render = given.pop("render", False)
+    saved = None
+    names = {key: given[key] for key in ("scene", "data", "name", "seed") if key in given}
+    cfg = make_config(names if resume or render else given)
+    scene_file = data_prep.scene_path(cfg.source)
+    run = Path("runs", cfg.name or f"{scene_file.stem}-{GeoNVS.name}-{cfg.seed}")
+    path = run / "checkpoint.pt"
     if resume or render:
-        given = {"minutes": 0.0} | given if "steps" in given else given  # of budgets the last one
-        saved, cfg = read_checkpoint(run / "checkpoint.pt", given)
-    need(cfg.rays % (cfg.photos * RANKS) == 0 and cfg.rays >= 2 * RANKS,
-         f"--rays {cfg.rays} must be a multiple of --photos {cfg.photos} times {RANKS} processes")
+        if "steps" in given:
+            given.setdefault("minutes", 0.0)  # of two budgets the last one given
+        saved, cfg = read_checkpoint(path, given)
+    check(cfg.rays % (cfg.photos * RANKS) == 0,
+          f"--rays {cfg.rays} must be a multiple of --photos {cfg.photos} times {RANKS} processes")
+    check(RANKS == 1 or not render, "--render takes one process: start it without torchrun")
     device = pick_device(cfg.device)
-    if device.type == "cuda":
-        torch.cuda.set_device(device)
     if RANKS > 1:
-        need("MASTER_ADDR" in os.environ, "start processes by torchrun, or unset WORLD_SIZE")
-        dist.init_process_group("cpu:gloo,cuda:nccl" if device.type == "cuda" else "gloo",
-                                timeout=datetime.timedelta(days=1))  # the first scores alone
-        sys.stdout = open(os.devnull, "w") if RANK else sys.stdout
-    opened = functools.cache(data_prep.open_scene)
-    agreed(RANK or bool(opened(cfg.source, cfg.downscale)))  # the first makes the file
-    scene = load_scene(opened(cfg.source, cfg.downscale), device)
+        start_processes(device)
+    if RANK == 0:
+        data_prep.open_scene(cfg.source, cfg.downscale)  # makes the file
+    from_first_process(None)  # the others wait for it
+    scene = load_scene(data_prep.open_scene(cfg.source, cfg.downscale), device)
     if render:
-        model = GeoNVS(cfg, scene)
-        restore(saved, run / "checkpoint.pt", model)
-        RANK or film(model, scene, run / "film.mp4")
+        with device:
+            model = GeoNVS(cfg, scene)
+        restore(saved, path, model, torch.Generator(device))
+        film(model, scene, run / "film.mp4")
     else:
         execute(cfg, scene, run, saved)
+    if RANKS > 1:
+        dist.destroy_process_group()
 
 
-def run_command_line(entry) -> None:
-    """Exit code 0, or 2 with one sentence on stderr. Several processes part in the end."""
+def run_command_line(entry):
+    """Exit code 0, or 2 with one sentence on stderr."""
     try:
         entry()
-        if dist.is_initialized():
-            dist.destroy_process_group()
-            gc.collect()  # a cycle that holds the group would keep its threads: exit would abort
         return
     except UserError as error:
         message = str(error)
     except (RuntimeError, MemoryError) as error:  # a CPU's allocator has no error of its own
-        if not re.search("MemoryError|allocate memory|out of memory", repr(error)):
+        if "memory" not in repr(error).lower():
             raise
-        message = ("the memory is full: go on with fewer --samples, or begin anew with fewer "
-                   "--rays, a lower --max_mb or a larger --downscale")
+        message = "the memory is full: begin anew with fewer --rays or a larger --downscale"
     except OSError as error:  # a full disk, a folder without permission
         message = f"{error}: free or choose a place, then go on with --resume"
     except KeyboardInterrupt:
