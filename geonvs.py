@@ -76,6 +76,16 @@ def opt(default, text, *choices):
     return field(default=default, metadata={"help": text, "choices": choices or None})
 
 
+AT_LEAST = dict(
+    steps=1,
+    downscale=1,
+    rays=2,
+    photos=1,
+    samples=3,
+    bg_samples=6,
+    hidden=1)
+
+
 @dataclass
 class Config:
     """All settings. Of the weights and sizes the paper gives lam_gpl alone."""
@@ -109,25 +119,31 @@ class Config:
 
     def __post_init__(self):
         """Refuses what cannot work, before anything is written."""
-        at_least = dict(samples=3, bg_samples=6, rays=2, photos=1, steps=1, downscale=1, hidden=1)
         for setting in fields(self):
             value = getattr(self, setting.name)
             choices = setting.metadata["choices"]
-            least = at_least.get(setting.name, 0)
             flag = f"--{setting.name} {value} makes no sense"
             check(choices is None or value in choices, f"{flag}: choose one of {choices}")
             if setting.type is not str:
+                least = AT_LEAST.get(setting.name, 0)
                 check(least <= value < 2**31, f"{flag}: use a number from {least}")
         check(self.rays % self.photos == 0, "--rays must be a multiple of --photos")
 
     @property
     def source(self):
         """What data_prep.open_scene takes: a scene's name, or a folder, never mistaken for one."""
-        return str(Path(self.data).resolve()) if self.data else self.scene
+        if self.data:
+            return str(Path(self.data).resolve())
+        return self.scene
 
 
 # settings of photos on a GPU that differ from Config's defaults; flags override them
-LARGE = dict(steps=300_000, rays=4096, photos=16, samples=32, appearance_dim=32)
+LARGE = dict(
+    steps=300_000,
+    rays=4096,
+    photos=16,
+    samples=32,
+    appearance_dim=32)
 
 
 # ---- 2 Scene file and rays -----------------------------------------------------------------------
@@ -153,21 +169,23 @@ class Scene(NamedTuple):
         return torch.nonzero(self.is_test == is_test)[:, 0]
 
 
-DTYPES = dict(i=torch.long, f=torch.float32, u=torch.uint8, b=torch.bool)  # by numpy's kinds
-
-
 def load_scene(raw, device="cpu"):
     """Scene from the dictionary of a scene file (data_prep.open_scene, make_toy or prepare)."""
-    side = int(np.clip(np.median(raw["wh"].max(1)) / 2, 96, 256))  # px [D6]
+    usual = np.median(raw["wh"].max(1))  # px
+    side = int(np.clip(usual / 2, 96, 256))  # [D6]
     thumbs = []
     for first, (w, h) in zip(raw["start"], raw["wh"]):
-        photo = raw["rgb"][first:first + w * h].reshape(h, w, 3)
+        photo = raw["rgb"][first:first + w * h]
+        photo = photo.reshape(h, w, 3)
         thumbs.append(cv2.resize(photo, (side, side), interpolation=cv2.INTER_AREA))
-    arrays = raw | dict(thumbs=np.stack(thumbs).transpose(0, 3, 1, 2))
+    arrays = [raw[key] for key in Scene._fields[:10]]
+    arrays.append(np.stack(thumbs).transpose(0, 3, 1, 2))
     tensors = []
-    for key in Scene._fields[:11]:
-        dtype = DTYPES[arrays[key].dtype.kind]
-        tensors.append(torch.as_tensor(arrays[key], dtype=dtype, device=device))
+    for array in arrays:
+        tensor = torch.as_tensor(array, device=device)
+        if tensor.is_floating_point():
+            tensor = tensor.float()
+        tensors.append(tensor)
     return Scene(*tensors, raw, json.loads(str(raw["info"])))
 
 
@@ -193,8 +211,9 @@ def make_rays(scene, img, pixel):
     col = pixel % wh[:, 0]
     row = pixel // wh[:, 0]
     xy = torch.stack([col, row], 1) + 0.5  # (R,2) px
-    d = F.pad((xy - K[:, 2:]) / K[:, :2], (0, 1), value=1.0)  # (R,3) in camera axes
-    d = torch.einsum("rij,rj->ri", c2w[:, :, :3], F.normalize(d))  # in the world's
+    d = (xy - K[:, 2:]) / K[:, :2]  # (R,2)
+    d = F.normalize(F.pad(d, (0, 1), value=1.0))  # (R,3) in camera axes
+    d = torch.einsum("rij,rj->ri", c2w[:, :, :3], d)  # in the world's
     rgb = scene.rgb[scene.start[img] + pixel] / 255
     return Rays(c2w[:, :, 3], d, scene.near[img, None], img, xy / wh, rgb)
 
@@ -202,6 +221,11 @@ def make_rays(scene, img, pixel):
 def uniform(gen, *shape):
     """Random numbers in [0, 1) on the generator's device."""
     return torch.rand(shape, generator=gen, device=gen.device)
+
+
+def random_index(gen, n, count):
+    """Random numbers (count,) among 0 .. n - 1."""
+    return (uniform(gen, count) * n).long()
 
 
 def random_rays(scene, img, gen, part=1.0):
@@ -232,7 +256,8 @@ MAX_CELLS = 8_000_000  # of the foreground: about 1 GB with Adam's moments
 
 def corner_weights(f):
     """Trilinear weights (P,8) of a cell's corners at f (P,3), 0..1 within the cell."""
-    x, y, z = torch.stack([1 - f.T, f.T]).unbind(1)  # (2,P) of both ends of each axis
+    ends = torch.stack([1 - f.T, f.T])  # (2,3,P)
+    x, y, z = ends.unbind(1)  # (2,P)
     w = torch.einsum("ip,jp,kp->ijkp", x, y, z)  # (2,2,2,P)
     return w.flatten(0, 2).T.contiguous()
 
@@ -280,7 +305,7 @@ class Octree(nn.Module):
         self.corner_key = torch.tensor([-1])  # (V,) the corner that owns a row
         self.row_stride = constant(root**2, root, 1)
         self.octant_stride = constant(4, 2, 1)
-        self.resolution = constant(*[root * 2.0**level for level in range(levels)])  # (L,)
+        self.resolution = nn.Buffer(root * 2.0 ** torch.arange(levels), persistent=False)  # (L,)
         self.build(self.corner_key)
 
     def side(self, level):
@@ -313,7 +338,8 @@ class Octree(nn.Module):
             is_split &= level < self.levels - 1
             levels.append(cells)
             splits.append(is_split)
-            index = (2 * index[is_split][:, None] + octants).flatten(0, 1)  # of the next level
+            children = 2 * index[is_split][:, None] + octants  # (N,8,3)
+            index = children.flatten(0, 1)
         self.cells = torch.cat(levels)  # (N,4) level, i, j, k
         self.finest = self.cells[-1, 0].item()  # level
         is_split = torch.cat(splits)
@@ -325,7 +351,8 @@ class Octree(nn.Module):
         key = self.key(corners)  # (N,8)
         _, number, cells_around = key.unique(return_inverse=True, return_counts=True)
         last = self.root << self.cells[:, :1, None]  # (N,1,1) index on the cube's far faces
-        is_within = (corners[:, :, 1:] > 0) & (corners[:, :, 1:] < last)  # (N,8,3)
+        index = corners[:, :, 1:]
+        is_within = (index > 0) & (index < last)  # (N,8,3)
         self.is_free = cells_around[number] == 2 ** is_within.sum(2)  # (N,8) not hanging
         old_key = self.corner_key
         self.corner_key = key[self.is_free].unique()  # (V,)
@@ -339,7 +366,8 @@ class Octree(nn.Module):
         """For x (P,3) and each level: the finest cell so far, a row of cells (P,L); whether the
         level has a cell there (P,L); the place in it, 0..1 (P,L,3). An x outside the cube is
         moved to its border."""
-        at = (0.5 + x * (0.5 / self.half)).clamp(0, 1 - 1e-6).nan_to_num(0)  # (P,3) over the cube
+        at = 0.5 + x * (0.5 / self.half)  # (P,3) over the cube
+        at = at.clamp(0, 1 - 1e-6).nan_to_num(0)
         at = at[:, None] * self.resolution[:, None]  # (P,L,3) in cells
         index = at.long()  # (P,L,3)
         octant = ((index & 1) * self.octant_stride).sum(2)  # (P,L)
@@ -351,14 +379,17 @@ class Octree(nn.Module):
             exists.append(child > 0)
             node = torch.where(exists[-1], child + octant[:, level], node)
             nodes.append(node)
-        return torch.stack(nodes, 1), torch.stack(exists, 1), at.frac()
+        nodes = torch.stack(nodes, 1)
+        exists = torch.stack(exists, 1)
+        return nodes, exists, at.frac()
 
     def forward(self, x):
         """Features (P,LC) at x (P,3)."""
         node, exists, place = self.locate(x)
         node = node.flatten()  # (PL,)
         w = corner_weights(place.flatten(0, 1))  # (PL,8)
-        w = w * self.is_free.index_select(0, node) * exists.reshape(-1, 1)
+        w = w * self.is_free.index_select(0, node)
+        w = w * exists.reshape(-1, 1)
         corner = self.corner.index_select(0, node)  # (PL,8)
         out = WeightedSum.apply(self.features, corner, w)  # (PL,C)
         return out.reshape(len(x), -1)
@@ -390,7 +421,8 @@ def seed_octree(octree, points, dense, near):
     so that no corner of a point's cell is hanging; then random features. [D10]"""
     for _ in range(dense):
         octree.split(octree.cells)
-    neighbours = F.pad(grid_index(3, points.device) - 1, (1, 0))  # (27,4)
+    step = grid_index(3, points.device) - 1  # (27,3)
+    neighbours = F.pad(step, (1, 0))  # (27,4)
     for _ in range(near):
         node, _, _ = octree.locate(points)
         home = octree.cells[node[:, -1].unique()]  # (N,4)
@@ -409,7 +441,8 @@ def refined_keys(octree, sdf, zeta):
     recorded there. A cell is merged if nothing near it is seen. [D15]"""
     level = octree.cells[:, 0]  # (N,)
     side = octree.side(level)
-    centre = (octree.cells[:, 1:] + 0.5) * side[:, None] - octree.half  # (N,3)
+    index = octree.cells[:, 1:]  # (N,3)
+    centre = (index + 0.5) * side[:, None] - octree.half
     s = in_chunks(sdf, centre).abs()  # (N,)
     reach = 1.87 * side  # half a cell's diagonal, and a cell
     is_split = octree.child > 0
@@ -442,14 +475,27 @@ def mixed_precision(network, x):
 
 def mlp(inputs, hidden, outputs):
     """A network with one hidden layer."""
-    return nn.Sequential(nn.Linear(inputs, hidden), nn.ReLU(), nn.Linear(hidden, outputs))
+    return nn.Sequential(
+        nn.Linear(inputs, hidden),
+        nn.ReLU(),
+        nn.Linear(hidden, outputs))
+
+
+A = 3**-0.5
+TAPS = (  # a point and, at a distance of 1, the ends of a tetrahedron
+    (0.0, 0.0, 0.0),
+    (A, A, A),
+    (A, -A, -A),
+    (-A, A, -A),
+    (-A, -A, A))
 
 
 def finite_differences(s, taps, eps):
     """Gradient (P,3) and Laplacian (P,) of a field from its values s (P,5) at x + eps taps: x
     itself, then the ends of a regular tetrahedron (Neuralangelo uses six ends). [D13]"""
     grad = 3 / (4 * eps) * (s @ taps)  # (P,3) as the sum of k k^T over the ends is 4/3
-    lap = 6 / eps**2 * (s[:, 1:].mean(1) - s[:, 0])
+    mean = s[:, 1:].mean(1)
+    lap = 6 / eps**2 * (mean - s[:, 0])
     return grad, lap
 
 
@@ -462,13 +508,13 @@ class SDFField(nn.Module):
         self.features = octree.features.shape[1] * octree.levels  # LC
         self.lin1 = nn.Linear(3 + self.features, hidden)
         self.lin2 = nn.Linear(hidden, 1 + GEO)
-        ends = torch.tensor([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / math.sqrt(3)
-        self.taps = nn.Buffer(F.pad(ends, (0, 0, 1, 0)), persistent=False)  # (5,3)
+        self.taps = constant(*TAPS)  # (5,3)
 
     def forward(self, x):
         """sdf (P,) and geometry (P,G) at x (P,3)."""
         feat = self.octree(x)  # (P,LC)
-        h = F.relu(self.lin1(torch.cat([x, feat], 1)))  # (P,H)
+        inputs = torch.cat([x, feat], 1)  # (P,3+LC)
+        h = F.relu(self.lin1(inputs))  # (P,H)
         sdf, geo = self.lin2(h).split([1, GEO], 1)  # (P,1), (P,GEO)
         return sdf[:, 0], torch.cat([geo, feat], 1)
 
@@ -548,7 +594,9 @@ def inverse_cdf(edges, weight, u):
     below = cdf.gather(1, left)
     width = cdf.gather(1, right) - below
     part = (u - below) / width.clamp(min=1e-9)
-    return torch.lerp(edges.gather(1, left), edges.gather(1, right), part.clamp(0, 1))
+    begin = edges.gather(1, left)
+    end = edges.gather(1, right)
+    return torch.lerp(begin, end, part.clamp(0, 1))
 
 
 PROBES = 64  # cheap lookups of the cached SDF per ray
@@ -567,7 +615,8 @@ class SDFCache(nn.Module):
         n = self.volume.shape[-1]
         line = torch.linspace(-1, 1, n, device=self.volume.device)  # (n,)
         x = torch.cartesian_prod(line[part::parts], line, line)  # (P,3)
-        self.volume[0, 0, part::parts] = in_chunks(sdf, x).reshape(-1, n, n)
+        s = in_chunks(sdf, x)  # (P,)
+        self.volume[0, 0, part::parts] = s.reshape(-1, n, n)
 
     def sdf(self, x):
         """s (R,N) at x (R,N,3), trilinear."""
@@ -582,7 +631,8 @@ class SDFCache(nn.Module):
         share = torch.linspace(0, 1, PROBES + 1, device=t0.device)
         probes = torch.lerp(t0, t1, share)  # (R,N+1)
         zeta = zeta.clamp(max=self.volume.shape[-1])  # surfaces at least half a voxel wide
-        weight, _ = composite(neus_alpha(self.sdf(rays.at(probes)), zeta))  # (R,N)
+        alpha = neus_alpha(self.sdf(rays.at(probes)), zeta)  # (R,N)
+        weight, _ = composite(alpha)
         even = UNIFORM_SHARE / (1 - UNIFORM_SHARE) * weight.mean(1, keepdim=True)
         n = jitter.shape[1]
         u = (torch.arange(n, device=t0.device) + jitter) / n  # (R,S-1)
@@ -592,7 +642,8 @@ class SDFCache(nn.Module):
 
 def contract(x):
     """Squeezes |x| > 1 into the ball of radius 2 (mip-NeRF 360 Eq. 10); identity inside."""
-    inverse = 1 / x.norm(dim=-1, keepdim=True).clamp(min=1)  # (...,1)
+    length = x.norm(dim=-1, keepdim=True)  # (...,1)
+    inverse = 1 / length.clamp(min=1)
     return x * (2 - inverse) * inverse
 
 
@@ -621,20 +672,26 @@ class Background(nn.Module):
         t = torch.cat([before, t1 + beyond], 1)  # (R,S)
         x = contract(rays.at(t)).flatten(0, 1)  # (RS,3)
         inputs = torch.cat([x, self.octree(x)], 1)  # (RS,3+LC)
-        density, geo = mixed_precision(self.density, inputs).split([1, GEO], 1)
+        out = mixed_precision(self.density, inputs)  # (RS,1+GEO)
+        density, geo = out.split([1, GEO], 1)
         inputs = torch.cat([geo, per_ray.repeat_interleave(S, 0)], 1)  # (RS,GEO+9+A)
-        rgb = mixed_precision(self.color, inputs).sigmoid().reshape(R, S, 3)
+        rgb = mixed_precision(self.color, inputs).sigmoid()
+        rgb = rgb.reshape(R, S, 3)
         sigma = F.softplus(density.reshape(R, S) - 1)
-        alpha = 1 - torch.exp(-sigma[:, :-1] * torch.diff(path))  # (R,S-1)
-        w, _ = composite(F.pad(alpha, (0, 1), value=1.0))  # (R,S)
-        front, behind = (w[:, :, None] * rgb).split([n, S - n], 1)
+        sigma = sigma[:, :-1]  # (R,S-1)
+        alpha = 1 - torch.exp(-sigma * torch.diff(path))
+        alpha = F.pad(alpha, (0, 1), value=1.0)  # (R,S)
+        w, _ = composite(alpha)
+        colors = w[:, :, None] * rgb
+        front, behind = colors.split([n, S - n], 1)
         passes = 1 - w[:, :n].sum(1, keepdim=True)
         return front.sum(1), passes, behind.sum(1)
 
 
 def direction_code(d):
     """Polynomials (R,9) of d (R,3), which span the spherical harmonics up to degree 2."""
-    return torch.cat([d, d * d, d * d.roll(1, 1)], 1)
+    mixed = d * d.roll(1, 1)
+    return torch.cat([d, d * d, mixed], 1)
 
 
 def render_rays(model, rays, code, jitter):
@@ -645,26 +702,34 @@ def render_rays(model, rays, code, jitter):
     S = model.cfg.samples
     zeta = model.deviation()
     t0, t1 = sphere_interval(rays)  # (R,1)
-    t = model.cache.distances(rays, t0, t1, jitter[:, 1:S].contiguous(), zeta)  # (R,S+1)
-    sdf, geo = model.sdf(rays.at(t).flatten(0, 1))  # (R(S+1),), (R(S+1),G)
+    inner = jitter[:, 1:S].contiguous()  # (R,S-1)
+    outer = jitter[:, S:]
+    t = model.cache.distances(rays, t0, t1, inner, zeta)  # (R,S+1)
+    x = rays.at(t).flatten(0, 1)  # (R(S+1),3)
+    sdf, geo = model.sdf(x)  # (R(S+1),), (R(S+1),G)
     alpha = neus_alpha(sdf.reshape(t.shape), zeta)  # (R,S)
     w, trans = composite(alpha)  # (R,S), (R,)
-    w = (F.pad(w, (1, 0)) + F.pad(w, (0, 1))) / 2  # (R,S+1) half to each end of a section
+    near_end = F.pad(w, (0, 1))  # (R,S+1)
+    far_end = F.pad(w, (1, 0))
+    w = (far_end + near_end) / 2  # half of a section's weight to each of its ends
 
-    depth = ((w * t).sum(1) + trans * t1[:, 0]).detach()  # (R,)
+    depth = (w * t).sum(1) + trans * t1[:, 0]
+    depth = depth.detach()  # (R,)
     end = rays.at(depth[:, None])[:, 0]  # (R,3)
     grad, lap = model.sdf.derivatives(end, model.eps)  # (R,3), (R,)
     normal = F.normalize(grad)
 
     per_ray = torch.cat([direction_code(rays.d), code], 1)  # (R,9+A)
-    of_samples = torch.cat([normal, per_ray], 1).repeat_interleave(S + 1, 0)
-    inputs = torch.cat([geo, of_samples], 1)  # (R(S+1),G+3+9+A)
+    constants = torch.cat([normal, per_ray], 1)  # (R,3+9+A) of all samples of a ray
+    constants = constants.repeat_interleave(S + 1, 0)
+    inputs = torch.cat([geo, constants], 1)  # (R(S+1),G+3+9+A)
     rgb = mixed_precision(model.color, inputs).sigmoid()
-    rgb = torch.einsum("rs,rsc->rc", w, rgb.reshape(*t.shape, 3))  # (R,3)
+    rgb = rgb.reshape(-1, S + 1, 3)
+    rgb = torch.einsum("rs,rsc->rc", w, rgb)  # (R,3)
     if model.background is None:
         rgb = rgb + trans[:, None] * model.bg_color
     else:
-        front, passes, behind = model.background(rays, t0, t1, per_ray, jitter[:, S:])
+        front, passes, behind = model.background(rays, t0, t1, per_ray, outer)
         rgb = front + passes * rgb + trans[:, None] * behind
     return dict(
         rgb=rgb,
@@ -713,7 +778,9 @@ class CGNet(nn.Module):
     The head reads all three resolutions: at 1/8 alone a mask could not follow an outline."""
     def __init__(self):
         super().__init__()
-        self.stage1 = nn.Sequential(conv(3, 16, stride=2), conv(16, 16, stride=1))
+        self.stage1 = nn.Sequential(
+            conv(3, 16, stride=2),
+            conv(16, 16, stride=1))
         self.stage2 = ContextBlock(16, 32, dilation=2)
         self.stage3 = ContextBlock(32, 64, dilation=4)
         self.head1 = nn.Conv2d(16, 1, 1)
@@ -733,7 +800,8 @@ class CGNet(nn.Module):
 
 def sample_logits(logits, uv):
     """Logits (R,) at uv (R,2) in 0..1 of logits (B,1,h,w); rays come photo by photo, R / B each."""
-    grid = (2 * uv - 1).reshape(len(logits), -1, 1, 2)  # (B,R/B,1,2)
+    grid = 2 * uv - 1
+    grid = grid.reshape(len(logits), -1, 1, 2)  # (B,R/B,1,2)
     at = F.grid_sample(logits, grid, padding_mode="border", align_corners=False)
     return at.flatten()
 
@@ -780,15 +848,16 @@ class TransientMask(nn.Module):
         super().__init__()
         self.cgnet = CGNet()
         self.thumbs = nn.Buffer(scene.thumbs, persistent=False)
-        self.quantiles = constant(0.5, 0.75, 0.95)
+        self.shares = constant(0.5, 0.75, 0.95)
         self.complexity = nn.Buffer(torch.tensor([0.5, 1.0, 4.0]))  # of the foreground
         self.sfm_error = nn.Buffer(torch.tensor([0.3]))  # upper quartile of rays at SfM points
         # which pixels of small photos show SfM points; some wrongly, at outlines [D10]
         n = scene.thumbs.shape[3] // 2
         static = torch.zeros(len(scene.thumbs), n, n, dtype=torch.bool)
-        is_seen = ((scene.track_uv >= 0) & (scene.track_uv < 1)).all(1)  # (T,)
-        col, row = (scene.track_uv[is_seen] * n).long().unbind(1)
-        static[scene.track_photo[is_seen], row, col] = True
+        uv = scene.track_uv
+        is_seen = ((uv >= 0) & (uv < 1)).all(1)  # (T,)
+        col, row = (uv[is_seen] * n).long().unbind(1)
+        static[scene.track_photo[is_seen].long(), row, col] = True
         self.static = nn.Buffer(static, persistent=False)
 
     def logits(self, photos):
@@ -797,11 +866,16 @@ class TransientMask(nn.Module):
 
     def share(self, photos):
         """Mean M (B,) of photos (B,)."""
-        return torch.cat([self.logits(i).sigmoid().mean((1, 2, 3)) for i in photos.split(1)])
+        means = []
+        for one in photos.split(1):
+            M = self.logits(one).sigmoid()
+            means.append(M.mean())
+        return torch.stack(means)
 
     def is_static(self, rays):
         """Which rays (R,) go through pixels that show SfM points."""
-        col, row = (rays.uv * self.static.shape[1]).long().unbind(1)
+        pixel = (rays.uv * self.static.shape[1]).long()  # (R,2)
+        col, row = pixel.unbind(1)
         return self.static[rays.img, row, col]
 
     def phi(self, complexity, opacity):
@@ -836,7 +910,8 @@ class GeoNVS(nn.Module):
         raw = scene.raw
         levels = cfg.levels
         if levels == 0:  # no cell smaller than a pixel
-            levels = 1 + math.floor(math.log2(2 / raw["footprint"] / 16))
+            pixels = 2 / raw["footprint"]  # from side to side
+            levels = 1 + math.floor(math.log2(pixels / 16))
             levels = min(max(levels, 2), 8)
         A = 0
         if is_on(cfg.appearance, raw["exposure_spread"] > 0.01):
@@ -852,17 +927,20 @@ class GeoNVS(nn.Module):
             LipschitzLinear(cfg.hidden, cfg.hidden),
             nn.ReLU(),
             LipschitzLinear(cfg.hidden, 3))
-        self.appearance = nn.Embedding(len(scene.wh), A).requires_grad_(A > 0)
+        self.appearance = nn.Embedding(len(scene.wh), A)
+        self.appearance.requires_grad_(A > 0)
         nn.init.normal_(self.appearance.weight, std=0.01)
         self.octrees = [octree]
         self.background = None
-        self.bg_color = constant(*raw["bg_color"].tolist()).float()
-        if is_on(cfg.background, bool(np.isnan(raw["bg_color"]).any())):
+        self.bg_color = constant(*np.nan_to_num(raw["bg_color"], nan=0.5).tolist())
+        has_view = bool(np.isnan(raw["bg_color"]).any())
+        if is_on(cfg.background, has_view):
             self.background = Background(scene.points[~is_inside], cfg.hidden, 9 + A)
             self.octrees.append(self.background.octree)
         self.deviation = Deviation()
         self.mask = TransientMask(scene)
-        self.cache = SDFCache(min(max(16 * 2 ** (levels - 1), 64), 128))
+        finest = 16 * 2 ** (levels - 1)  # cells along an axis
+        self.cache = SDFCache(min(max(finest, 64), 128))
         print(f"  {levels} levels, appearance code of {A}, {len(self.octrees)} octrees")
 
     @property
@@ -897,15 +975,16 @@ class GeoNVS(nn.Module):
             price = self.mask.price(phi, cfg.lam_mask, cfg.lam_gpl)
             l_mask = transient_loss(logit, error * ~is_static, price)
 
-        which = (uniform(gen, R, 1) * (cfg.samples + 1)).long()
-        x = rays.at(out["t"].gather(1, which))[:, 0]  # (R,3) a random sample of each ray [D13]
-        taps = (x[:, None] + self.eps * self.sdf.taps).flatten(0, 1)  # (5R,3)
+        which = random_index(gen, cfg.samples + 1, R)
+        t = out["t"].gather(1, which[:, None])  # (R,1) a random sample of each ray [D13]
+        taps = rays.at(t) + self.eps * self.sdf.taps  # (R,5,3)
         cube = 2 * uniform(gen, R // 2, 3) - 1
-        sfm = self.sfm[(uniform(gen, R // 2) * len(self.sfm)).long()]
-        s = self.distance(torch.cat([taps, cube, sfm]))
-        s_taps, s_cube, s_sfm = s.split([5 * R, R // 2, R // 2])
+        sfm = self.sfm[random_index(gen, len(self.sfm), R // 2)]
+        points = torch.cat([taps.flatten(0, 1), cube, sfm])
+        s_taps, s_cube, s_sfm = self.distance(points).split([5 * R, R // 2, R // 2])
         grad, _ = finite_differences(s_taps.reshape(R, 5), self.sdf.taps, self.eps)
-        e_grad = (out["e_grad"] + (grad.norm(dim=1) - 1) ** 2) / 2  # (R,)
+        e_grad = (grad.norm(dim=1) - 1) ** 2  # (R,)
+        e_grad = (out["e_grad"] + e_grad) / 2
         pull = self.deviation().detach().clamp(max=40)  # [D10]
 
         terms = dict(
@@ -937,17 +1016,17 @@ class GeoNVS(nn.Module):
     @torch.no_grad()
     def observe(self, rays, out):
         """Remembers what refining and the mask's prices depend on."""
-        memory = self.mask
+        mask = self.mask
         is_solid = out["opacity"] > 0.5  # (R,)
-        follow_quantiles(memory.complexity, memory.quantiles, out["detail"], is_solid)
-        follow_quantiles(memory.sfm_error, memory.quantiles[1:2], out["error"], out["is_static"])
+        follow_quantiles(mask.complexity, mask.shares, out["detail"], is_solid)
+        follow_quantiles(mask.sfm_error, mask.shares[1:2], out["error"], out["is_static"])
         pixel = out["depth"] / self.scene.K[rays.img, 0]  # (R,) its size at the ray's end
         error = (1 - out["mask"]) * out["error"]
         self.sdf.octree.record(out["end"], error, pixel, is_solid.float())
 
     def batch(self, photos, n, gen):
         """n random rays and the photos (B,) they come from, photo by photo."""
-        which = (uniform(gen, self.cfg.photos) * len(photos)).long()
+        which = random_index(gen, len(photos), self.cfg.photos)
         picked = photos[which]  # (B,)
         img = picked.repeat_interleave(n // len(picked))  # (R,)
         return random_rays(self.scene, img, gen), picked
@@ -970,7 +1049,10 @@ class GeoNVS(nn.Module):
         """Warm-up: L_sphere fits the SDF to a sphere. A small one: a surface that starts inside the
         landmark grows to it, one that starts outside also has to be carved out of the sky."""
         grid, *networks = self.sdf.parameters()
-        adam = torch.optim.Adam([dict(params=[grid], lr=1e-3), dict(params=networks, lr=5e-3)])
+        groups = [
+            dict(params=[grid], lr=1e-3),
+            dict(params=networks, lr=5e-3)]
+        adam = torch.optim.Adam(groups)
         for _ in range(steps):
             x = 2 * uniform(gen, 1024, 3) - 1  # (P,3)
             sphere = x.norm(dim=1) - radius
@@ -996,7 +1078,8 @@ class GeoNVS(nn.Module):
     def decide_mask(self):
         """--mask auto: off if M marks hardly anything in the training photos. [D15]"""
         if self.cfg.mask == "auto":
-            share = self.mask.share(self.scene.photos(False)).mean().item()
+            shares = self.mask.share(self.scene.photos(False))
+            share = shares.mean().item()
             is_needed = from_first_process(share > 0.01)
             self.cfg.mask = "on" if is_needed else "off"
             print(f"  mean mask {share:.4f}: mask {self.cfg.mask}")
@@ -1008,7 +1091,8 @@ class GeoNVS(nn.Module):
     def render(self, rays, code):
         """render_rays without jitter, for pictures and for fitting codes."""
         draws = self.cfg.samples + self.cfg.bg_samples
-        return render_rays(self, rays, code, code.new_full((len(code), draws), 0.5))
+        jitter = code.new_full((len(code), draws), 0.5)
+        return render_rays(self, rays, code, jitter)
 
 
 # ---- 8 Energy ------------------------------------------------------------------------------------
@@ -1236,7 +1320,7 @@ def report(model, path, done, state, terms):
         line[key] = float(value)
     with open(path, "a") as file:
         file.write(json.dumps(line) + "\n")
-    left = state["seconds"] * max(0, 1 / max(done, 1e-3) - 1) / 60
+    left = state["seconds"] / 60 * max(0, 1 / max(done, 1e-3) - 1)
     print(f"  step {state['step']:6d}  psnr {line['psnr']:.2f}  {left:.1f} min left", flush=True)
 
 
@@ -1244,7 +1328,8 @@ def report(model, path, done, state, terms):
 
 def to_uint8(picture):
     """Numbers in 0..1, numpy or torch, as bytes in numpy."""
-    return (np.asarray(picture).clip(0, 1) * 255 + 0.5).astype(np.uint8)
+    levels = np.asarray(picture).clip(0, 1) * 255
+    return (levels + 0.5).astype(np.uint8)
 
 
 def psnr(a, b):
@@ -1263,16 +1348,22 @@ def make_lpips(device):
         return None
 
     def distance(*pictures):
-        batch = torch.as_tensor(np.stack(pictures), dtype=torch.float32, device=device)
-        return net(*batch.permute(0, 3, 1, 2).split(1), normalize=True).item()
+        batch = torch.as_tensor(np.stack(pictures), device=device).float()
+        a, b = batch.permute(0, 3, 1, 2).split(1)  # (1,3,H,W)
+        return net(a, b, normalize=True).item()
     return distance
+
+
+def mean_code(model):
+    """Mean appearance code (A,) of the training photos."""
+    return model.codes()[~model.scene.is_test].mean(0)
 
 
 def fit_codes(model, scene, photos, steps=128, n=64):
     """Appearance codes (B,A) of unseen photos (B,): Adam on n random rays a step of each left half
     [D12], from the mean code of the training photos. The scene stays as it is."""
     gen = torch.Generator(scene.c2w.device).manual_seed(0)
-    codes = model.codes()[~scene.is_test].mean(0).repeat(len(photos), 1)  # (B,A)
+    codes = mean_code(model).repeat(len(photos), 1)  # (B,A)
     if codes.numel() == 0:
         return codes
     adam = torch.optim.Adam([codes.requires_grad_()])
@@ -1303,9 +1394,10 @@ def render_photo(model, scene, photo, code):
     for chosen in torch.arange(w * h, device=code.device).split(1024):
         some = Rays(*[column[chosen] for column in rays])
         out = model.render(some, code.expand(len(chosen), -1))
-        parts.append(torch.cat([out["rgb"], some.rgb, out["normal"]], 1))  # (R,9)
-    picture = torch.cat(parts).reshape(h, w, 9).cpu().numpy()
-    rgb, truth, normal = np.split(picture, 3, axis=2)
+        columns = torch.cat([out["rgb"], some.rgb, out["normal"]], 1)  # (R,9)
+        parts.append(columns)
+    picture = torch.cat(parts).reshape(h, w, 9)
+    rgb, truth, normal = np.split(picture.cpu().numpy(), 3, axis=2)
     return dict(rgb=rgb, truth=truth, normal=normal)
 
 
@@ -1318,11 +1410,20 @@ def score(frame, lpips=None):
     want = to_uint8(truth[:, half:]) / 255
     got = to_uint8(frame["rgb"][:, half:]) / 255
     flat = to_uint8(truth[:, :half].mean(1, keepdims=True)) / 255
-    row = dict(psnr=psnr(got, want), psnr_floor=psnr(flat, want), ssim=None, lpips=None)
+    row = dict(
+        psnr=psnr(got, want),
+        psnr_floor=psnr(flat, want),
+        ssim=None,
+        lpips=None)
     side = min(got.shape[:2])
     if side >= 11:
         ssim = structural_similarity(
-            got, want, channel_axis=2, data_range=1, gaussian_weights=True, sigma=1.5,
+            got,
+            want,
+            channel_axis=2,
+            data_range=1,
+            gaussian_weights=True,
+            sigma=1.5,
             use_sample_covariance=False)
         row["ssim"] = float(ssim)
     if lpips and side >= 32:
@@ -1337,7 +1438,8 @@ def evaluate(model, scene, lpips=None):
     codes = fit_codes(model, scene, photos)  # (B,A)
     rows = []
     frames = []
-    for photo, code in progress(list(zip(photos.tolist(), codes)), "scoring held-out photos"):
+    pairs = list(zip(photos.tolist(), codes))
+    for photo, code in progress(pairs, "scoring held-out photos"):
         name = str(scene.raw["name"][photo])
         frame = render_photo(model, scene, photo, code)
         rows.append(dict(name=name) | score(frame, lpips))
@@ -1364,7 +1466,8 @@ def toy_truth(model, scene):
         pixels = slice(*raw["start"][photo:photo + 2])
         depth = torch.as_tensor(raw["depth"][pixels]).to(rays.d)  # (R,) infinite for the sky
         walls.append(rays.at(depth[:, None])[:, 0])
-        masks.append(sample_logits(model.mask.logits([photo]), rays.uv).sigmoid())
+        logits = model.mask.logits([photo])
+        masks.append(sample_logits(logits, rays.uv).sigmoid())
         people.append(raw["occluder"][pixels])
     wall = torch.cat(walls)[::9]  # (P,3)
     wall = wall[wall.norm(dim=1) < 0.95]
@@ -1375,9 +1478,11 @@ def toy_truth(model, scene):
         return torch.as_tensor(s / raw["scale"]).to(x)
 
     gen = torch.Generator().manual_seed(0)
-    x = wall + 0.02 * torch.randn(wall.shape, generator=gen).to(wall)  # around the surface
+    noise = torch.randn(wall.shape, generator=gen).to(wall)
+    x = wall + 0.02 * noise
     true = true_sdf(x)
-    error = (in_chunks(model.distance, x) - true).abs()[true.abs() < 0.05]
+    error = (in_chunks(model.distance, x) - true).abs()
+    error = error[true.abs() < 0.05]
 
     eps = 0.004
     taps = model.sdf.taps
@@ -1397,7 +1502,9 @@ def toy_truth(model, scene):
         found = mask > 0.5
         truth["mask_static"] = float(mask[~people].mean())
         if people.any():
-            truth["mask_iou"] = float((found & people).sum() / (found | people).sum())
+            both = (found & people).sum()
+            either = (found | people).sum()
+            truth["mask_iou"] = float(both / either)
     return truth
 
 
@@ -1409,26 +1516,32 @@ def extract_mesh(model):
     evaluated, elsewhere the cache has the sign."""
     cache = model.cache.volume
     n = min(round(2 / model.eps), 512)
-    volume = F.interpolate(cache, size=(n + 1,) * 3, mode="trilinear", align_corners=True)[0, 0]
-    index = grid_index(n + 1, cache.device)
-    radius = (index * (2 / n) - 1).norm(dim=1).reshape(volume.shape)
+    size = [n + 1] * 3
+    volume = F.interpolate(cache, size=size, mode="trilinear", align_corners=True)[0, 0]
+    x = grid_index(n + 1, cache.device) * (2 / n) - 1  # (P,3)
+    volume = volume.flatten()  # (P,)
+    radius = x.norm(dim=1)
     near = (volume.abs() < 6 / cache.shape[-1]) & (radius < 1)
-    volume[near] = in_chunks(model.distance, near.nonzero() * (2 / n) - 1)
+    volume[near] = in_chunks(model.distance, x[near])
     is_inside = radius < 1 - 4 / n  # so that all corners of the cells there are evaluated
     if len((volume[is_inside] < 0).unique()) < 2:
-        return np.zeros((0, 3)), np.zeros((0, 3), int), np.zeros((0, 3), np.uint8)
-    vertices, faces, _, _ = marching_cubes(volume.cpu().numpy(), 0, mask=is_inside.cpu().numpy())
-    x = torch.tensor(vertices * (2 / n) - 1, dtype=torch.float32, device=cache.device)
+        empty = np.zeros((0, 3))
+        return empty, empty, empty
+    volume = volume.reshape(size).cpu().numpy()
+    mask = is_inside.reshape(size).cpu().numpy()
+    vertices, faces, _, _ = marching_cubes(volume, 0, mask=mask)
+    vertices = vertices * (2 / n) - 1
+    x = torch.tensor(vertices, dtype=torch.float32, device=cache.device)
     colors = in_chunks(lambda part: surface_color(model, part), x)
     raw = model.scene.raw
-    return x.cpu().numpy() * raw["scale"] + raw["center"], faces, to_uint8(colors.cpu())
+    return vertices * raw["scale"] + raw["center"], faces, to_uint8(colors.cpu())
 
 
 def surface_color(model, x):
     """Colours (P,3) of surface points (P,3), seen along their normals under the mean code."""
     grad, _ = model.sdf.derivatives(x, model.eps)
     normal = F.normalize(grad)
-    code = model.codes()[~model.scene.is_test].mean(0).expand(len(x), -1)
+    code = mean_code(model).expand(len(x), -1)
     _, geo = model.sdf(x)
     inputs = torch.cat([geo, normal, direction_code(-normal), code], 1)
     return mixed_precision(model.color, inputs).sigmoid()
@@ -1467,13 +1580,14 @@ def write_panel(path, model, frames, width=240):
         tiles = {title: frame["truth"], "render": frame["rgb"]}
         if isinstance(model, GeoNVS):
             tiles["normals"] = frame["normal"] / 2 + 0.5
-            M = model.mask.logits([photo])[0, 0].sigmoid().detach()  # (m,m)
-            colors = cv2.applyColorMap(to_uint8(M.cpu()), cv2.COLORMAP_VIRIDIS)
+            M = model.mask.logits([photo]).detach().sigmoid()  # (1,1,m,m)
+            colors = cv2.applyColorMap(to_uint8(M[0, 0].cpu()), cv2.COLORMAP_VIRIDIS)
             tiles["mask: yellow is transient"] = colors[:, :, ::-1] / 255
         h, w = frame["rgb"].shape[:2]
         row = []
         for text, tile in tiles.items():
-            tile = cv2.resize(to_uint8(tile), (width, width * h // w), interpolation=cv2.INTER_AREA)
+            size = (width, width * h // w)
+            tile = cv2.resize(to_uint8(tile), size, interpolation=cv2.INTER_AREA)
             tile = np.pad(tile, ((20, 4), (0, 4), (0, 0)), constant_values=255)
             cv2.putText(tile, text, (2, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.4, (0, 0, 0), 1, 16)
             row.append(tile)
@@ -1542,23 +1656,28 @@ def film(model, scene, path, pixels=40_000):
     axis = centre.std(0).argmax()  # along which cameras spread most
     photos = photos[centre[:, axis].argsort()]
     stops = photos[::math.ceil(len(photos) / 7)]
-    path_c2w = in_between(scene.c2w[stops].flatten(1)).reshape(-1, 3, 4)
+    path_c2w = in_between(scene.c2w[stops].flatten(1))
+    path_c2w = path_c2w.reshape(-1, 3, 4)
     left, _, right = torch.linalg.svd(path_c2w[:, :, :3])
-    left[:, :, 2] *= torch.linalg.det(left @ right)[:, None]
+    sign = torch.linalg.det(left @ right)  # -1 for a reflection
+    left[:, :, 2] *= sign[:, None]
     path_c2w[:, :, :3] = left @ right  # the nearest rotation
     codes = model.codes()[photos]
     view = photos[len(photos) // 2]
     shots = [(c2w, codes.mean(0)) for c2w in path_c2w]
-    shots += [(scene.c2w[view], code) for code in in_between(codes)] if codes.numel() else []
-    scale = (pixels / scene.wh[view].prod()).sqrt().clamp(max=1)
+    if codes.numel() > 0:
+        shots += [(scene.c2w[view], code) for code in in_between(codes)]
+    wh = scene.wh[view]
+    scale = (pixels / wh.prod()).sqrt().clamp(max=1)
+    wh = (wh * scale / 2).long() * 2  # even sides
     one = scene._replace(
-        wh=(scene.wh[view] * scale / 2).long()[None] * 2,  # even sides
+        wh=wh[None],
         K=scene.K[view][None] * scale,
         near=scene.near[photos].min()[None])  # as cameras between the photos may be nearer
 
     def write(part):
         codec = cv2.VideoWriter_fourcc(*"mp4v")
-        video = cv2.VideoWriter(str(part), codec, 24, one.wh[0].tolist())
+        video = cv2.VideoWriter(str(part), codec, 24, wh.tolist())
         check(video.isOpened(), "OpenCV cannot write mp4 here")
         for c2w, code in progress(shots, f"filming {len(shots)} frames"):
             frame = render_photo(model, one._replace(c2w=c2w[None]), 0, code)
@@ -1595,7 +1714,8 @@ def make_parser():
 
 def pick_device(name):
     """The device of this process: with torchrun each has its own GPU."""
-    there = ["cpu"] + [f"cuda:{i}" for i in range(torch.cuda.device_count())]
+    count = torch.cuda.device_count()
+    there = ["cpu"] + [f"cuda:{i}" for i in range(count)]
     if name == "auto":
         name = "cuda" if len(there) > 1 else "cpu"
     if name == "cuda":
@@ -1638,7 +1758,8 @@ def main(argv=None):
     resume = given.pop("resume", False)
     render = given.pop("render", False)
     saved = None
-    names = {key: given[key] for key in ("scene", "data", "name", "seed") if key in given}
+    found_by = ("scene", "data", "name", "seed")
+    names = {key: value for key, value in given.items() if key in found_by}
     cfg = make_config(names if resume or render else given)
     scene_file = data_prep.scene_path(cfg.source)
     run = Path("runs", cfg.name or f"{scene_file.stem}-{GeoNVS.name}-{cfg.seed}")
