@@ -30,7 +30,8 @@ Where the printed paper is departed from, the line carries its tag:
   [D5]  the Lipschitz term is a sum of logs, not a product that can drown the colour at first
   [D6]  a small CGNet on small square photos: one plain block a stage, GroupNorm, ReLU, finer head
   [D7]  M is taught as a classification: transient where a ray's error exceeds its price, which
-        is what SfM pixels err by, plus lam_mask, plus lam_gpl Phi; no term for bimodality
+        is what SfM pixels err by, plus lam_mask, plus lam_gpl Phi; no term for bimodality; only
+        in the first 60 % of training
   [D8]  the background also fills what lies before the sphere; its last section is opaque
   [D9]  mixed precision for the colour and background networks alone: distances stay float32
   [D10] SfM points place the sphere, seed the octree, teach M = 0 and pull s(p) to zero, but less
@@ -105,7 +106,7 @@ class Config:
     hidden: int = opt(64, "width of the MLPs")
     appearance_dim: int = opt(16, "length of a photo's appearance code")
     appearance: str = opt("auto", "codes; auto: on if exposures differ", "auto", "on", "off")
-    mask: str = opt("auto", "auto: off if it marks under 1 %", "auto", "on", "off")
+    mask: str = opt("auto", "auto: off if it marks hardly anything", "auto", "on", "off")
     background: str = opt("auto", "field; auto: off if it is one colour", "auto", "on", "off")
     lam_eik: float = opt(0.04, "weight of the eikonal loss (Permuto-SDF)")
     lam_curv: float = opt(0.01, "weight of the curvature loss, on |lap| eps [D4]")
@@ -184,7 +185,7 @@ def load_scene(raw, device="cpu"):
     for array in arrays:
         tensor = torch.as_tensor(array, device=device)
         if tensor.is_floating_point():
-            tensor = tensor.float()
+            tensor = tensor.to(torch.get_default_dtype())
         tensors.append(tensor)
     return Scene(*tensors, raw, json.loads(str(raw["info"])))
 
@@ -784,8 +785,8 @@ class CGNet(nn.Module):
         self.stage2 = ContextBlock(16, 32, dilation=2)
         self.stage3 = ContextBlock(32, 64, dilation=4)
         self.head1 = nn.Conv2d(16, 1, 1)
-        self.head2 = nn.Conv2d(32, 1, 1)
-        self.head3 = nn.Conv2d(64, 1, 1)
+        self.head2 = nn.Conv2d(32, 1, 1, bias=False)
+        self.head3 = nn.Conv2d(64, 1, 1, bias=False)
         nn.init.constant_(self.head1.bias, -2.5)  # starts with 8 % masked, not with half
 
     def forward(self, photo):
@@ -840,6 +841,7 @@ def follow_quantiles(running, shares, values, is_meant, rate=0.1):
 
 
 LEAST_PRICE = 0.15  # error of a ray below which it is never transient
+TAUGHT = 0.6  # share of training in which the mask learns: a model that goes on paints people
 
 
 class TransientMask(nn.Module):
@@ -1008,8 +1010,10 @@ class GeoNVS(nn.Module):
         return total, terms, out
 
     def before_step(self, step, done):
-        """Keeps zeta within its bounds and an eighth of the cache up to date. done: 0..1."""
+        """Keeps zeta within its bounds and an eighth of the cache up to date, and ends the mask's
+        lessons. done: 0..1."""
         self.deviation.bound(done, most=32 * self.cfg.samples)  # about 1 / the finest section
+        self.mask.requires_grad_(done < TAUGHT)
         if step % 8 == 0:
             self.cache.refresh(self.distance, step // 8 % 8, 8)
 
@@ -1768,7 +1772,7 @@ def main(argv=None):
         if "steps" in given:
             given.setdefault("minutes", 0.0)  # of two budgets the last one given
         saved, cfg = read_checkpoint(path, given)
-    check(cfg.rays % (cfg.photos * RANKS) == 0,
+    check(cfg.rays % (cfg.photos * RANKS) == 0 and cfg.rays > RANKS,
           f"--rays {cfg.rays} must be a multiple of --photos {cfg.photos} times {RANKS} processes")
     check(RANKS == 1 or not render, "--render takes one process: start it without torchrun")
     device = pick_device(cfg.device)
