@@ -3,34 +3,67 @@
     python data_prep.py toy --occluders 0.4     -> data/toy.npz; every knob of make_toy is a flag
     python data_prep.py brandenburg --download  -> data/brandenburg.npz, from an archive of 5 GB
     python data_prep.py my_photos --sfm         raw photos, by pycolmap -> data/my_photos-*.npz
-    python data_prep.py my_scene                my_scene/[dense/]{images,sparse} -> the same
+    python data_prep.py my_scene                photos and a COLMAP model in it -> the same
 
 The landmark lies in the unit sphere. A ray is c2w[:, 3] + t * d with |d| = 1; a distance is this t,
 never a z-depth. Functions raise UserError, one sentence that says what to do.
 """
-import argparse, contextlib, gzip, http.client, inspect, io, itertools, json, math, os, shutil
-import struct, sys, tarfile, tempfile, time, urllib.request, zipfile, zlib
+import argparse
+import collections
+import gzip
+import http.client
+import inspect
+import io
+import itertools
+import json
+import math
+import os
+import shutil
+import struct
+import sys
+import tarfile
+import tempfile
+import time
+import urllib.request
+import zipfile
+import zlib
+from dataclasses import dataclass
 from pathlib import Path
 
-import cv2, skimage.io
+import cv2
 import numpy as np
 
-SCENES = {"brandenburg": ("brandenburg_gate", "brandenburg.tsv"),   # name: (archive, split file)
-          "sacre": ("sacre_coeur", "sacre.tsv"), "trevi": ("trevi_fountain", "trevi.tsv"),
-          "taj": ("taj_mahal", "taj_mahal.tsv")}
+# name: (archive, split file)
+SCENES = {
+    "brandenburg": ("brandenburg_gate", "brandenburg.tsv"),
+    "sacre": ("sacre_coeur", "sacre.tsv"),
+    "trevi": ("trevi_fountain", "trevi.tsv"),
+    "taj": ("taj_mahal", "taj_mahal.tsv"),
+}
 ARCHIVE_URL = "https://www.cs.ubc.ca/research/kmyi_data/imw2020/TrainingData/"
 SPLIT_URL = "https://nerf-w.github.io/data/selected_images/"
 # A scene is one .npz of these arrays: I photos, J = I + 1, N pixels, K points, T observations. A
 # toy has two more: depth float16 (N,), true distance, inf is sky; occluder bool (N,), by people.
 FORMAT = dict(
-    rgb="uint8 N3", start="int64 J",   # photo i is rgb[start[i]:start[i+1]], row by row
-    wh="int32 I2", K="float64 I4",   # width, height; fx fy cx cy [px]; first pixel's centre 0.5 0.5
+    rgb="uint8 N3",
+    start="int64 J",   # photo i is rgb[start[i]:start[i + 1]], row by row
+    wh="int32 I2",   # width, height
+    K="float64 I4",   # fx fy cx cy [px]; the first pixel's centre is at 0.5 0.5
     c2w="float64 I34",   # camera to world; OpenCV: x right, y down, z forward
-    is_test="bool I", name="<U I",   # held out from training; file name
-    points="float32 K3", center="float64 3", scale="float64",   # SfM units: x * scale + center
-    track_photo="int32 T", track_point="int32 T", track_uv="float32 T2",   # see statistics
-    near="float32 I", footprint="float64", exposure_spread="float64", bg_color="float64 3",
-    info="<U")   # JSON: scene, kind (toy or colmap), downscale, folder, split; of a toy its knobs
+    is_test="bool I",   # held out from training
+    name="<U I",
+    points="float32 K3",
+    center="float64 3",   # SfM units: x * scale + center
+    scale="float64",
+    track_photo="int32 T",   # sorted; this photo sees
+    track_point="int32 T",   # this point
+    track_uv="float32 T2",   # there, over wh: in 0..1 if inside
+    near="float32 I",
+    footprint="float64",
+    exposure_spread="float64",
+    bg_color="float64 3",
+    info="<U",   # JSON: scene, kind (toy or colmap), downscale, folder, split; of a toy its knobs
+)
 FAR = 1e9   # sound reconstructions have no larger number; float32 holds its square
 
 
@@ -38,20 +71,32 @@ class UserError(Exception):
     """Something that the person at the keyboard can mend: one sentence that says how."""
 
 
-def need(ok, message):
+def check(ok, message):
     if not ok:
         raise UserError(message)
 
 
-def tell(items, what):
-    """Yields items; once that took ten seconds, a line of the terminal says how far it is."""
-    begin, due, total = time.monotonic(), 10, len(items)
+def warn(message):
+    print(message, file=sys.stderr)
+
+
+def progress(items, what):
+    """Yields items; says how far it is once that took ten seconds, or a minute in a log file."""
+    is_terminal = sys.stdout.isatty()
+    wait = 1 if is_terminal else 60
+    due = 10 if is_terminal else 60
+    begin = time.monotonic()
+    total = len(items)
     for done, item in enumerate(items, 1):
         yield item
         past = time.monotonic() - begin
-        if past > due or due > 10 and done == total:
-            due, left, end = past + 1, past / done * (total - done), "\n" if done == total else ""
-            print(f"\r  {what}: {done} of {total}, {left:.0f} s left ", end=end, flush=True)
+        is_last = done == total
+        if past > due or (is_last and past > 10):
+            due = past + wait
+            left = past / done * (total - done)
+            start = "\r" if is_terminal else ""
+            end = "" if is_terminal and not is_last else "\n"
+            print(f"{start}  {what}: {done} of {total}, {left:.0f} s left ", end=end, flush=True)
 
 
 def atomic_write(path, write):
@@ -59,10 +104,12 @@ def atomic_write(path, write):
     part = path.with_name(f".{path.stem}.{os.getpid()}.{time.time_ns()}{path.suffix}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        need(write(part) is not False, f"cannot encode {path}")   # so cv2.imwrite says no
+        result = write(part)
+        check(result is not False, f"cannot encode {path}")   # so cv2.imwrite says no
         os.replace(part, path)
     except OSError as e:
-        raise UserError(f"cannot write {path} ({e.strerror or e}): free or choose a place") from e
+        why = e.strerror or e
+        raise UserError(f"cannot write {path} ({why}): free or choose a place") from e
     finally:
         if part.exists():
             part.unlink()
@@ -76,8 +123,33 @@ def write_scene(path, scene):
 def refuse_bomb(path):
     """Raises BadZipFile for what is no zip file, or larger inside than outside: ours never are."""
     with zipfile.ZipFile(path) as file:
-        if sum(member.file_size for member in file.infolist()) > os.path.getsize(path):
+        inside = sum(member.file_size for member in file.infolist())
+        if inside > os.path.getsize(path):
             raise zipfile.BadZipFile(f"{path} is larger inside than outside")
+
+
+def check_scene(scene):
+    """UserError unless the arrays fit FORMAT and each other."""
+    start = scene["start"]
+    wh = scene["wh"]
+    observations = scene["track_photo"], scene["track_point"]
+    sizes = dict(I=len(wh), J=len(wh) + 1, K=len(scene["points"]))
+    sizes.update(T=len(observations[0]), N=start[-1])
+    for key, text in FORMAT.items():
+        array = scene[key]
+        dtype, _, letters = text.partition(" ")
+        shape = tuple(sizes.get(letter) or int(letter) for letter in letters)
+        check(array.shape == shape and str(array.dtype).startswith(dtype), key)
+        if dtype.startswith("f") and key != "bg_color":
+            check(np.isfinite(array).all(), key)
+    check((wh > 0).all() and start[0] == 0, "start")
+    check((np.diff(start) == wh.prod(1)).all(), "start")
+    check(np.min(observations) >= 0, "tracks")
+    check((np.max(observations, 1) < (sizes["I"], sizes["K"])).all(), "tracks")
+    check(min(scene["footprint"], scene["scale"]) > 0, "scale")
+    check(not scene["is_test"].all(), "is_test")
+    info = json.loads(str(scene["info"]))
+    check({"kind", "scene", "downscale", "folder", "split"} <= set(info), "info")
 
 
 def read_scene(path):
@@ -86,143 +158,238 @@ def read_scene(path):
         refuse_bomb(path)
         with np.load(path, allow_pickle=False) as file:
             scene = {key: file[key] for key in file.files}
-        start, wh, seen = scene["start"], scene["wh"], (scene["track_photo"], scene["track_point"])
-        size = dict(I=len(wh), J=len(wh) + 1, K=len(scene["points"]), T=len(seen[0]), N=start[-1])
-        for key, text in FORMAT.items():
-            array, (kind, _, shape) = scene[key], text.partition(" ")
-            need(array.shape == tuple(size.get(n) or int(n) for n in shape), key)
-            need(str(array.dtype).startswith(kind), key)
-            need(kind[0] != "f" or key == "bg_color" or np.isfinite(array).all(), key)
-        need(start[0] == 0 and (wh > 0).all() and (np.diff(start) == wh.prod(1)).all(), "start")
-        need(np.min(seen) >= 0 and (np.max(seen, 1) < (size["I"], size["K"])).all(), "tracks")
-        need(min(scene["footprint"], scene["scale"]) > 0 and not scene["is_test"].all(), "scale")
-        info = json.loads(str(scene["info"]))
-        need({"kind", "scene", "downscale", "folder", "split"} <= {*info}, "info")
+        check_scene(scene)
     except Exception as e:   # a damaged file can fail in any layer: zip, array header, dtype, text
         raise UserError(f"{path} is no whole scene, or too large: delete it, it is remade") from e
     return scene
 
 
 # ---- the toy: z up, front towards -y, in its own units; world = TOY_SCALE * x + TOY_ORIGIN -------
-TOY_SCALE, TOY_ORIGIN, INF = 3.7, np.array([12.0, -7.0, 5.0]), np.inf
+TOY_SCALE = 3.7
+TOY_ORIGIN = np.array([12.0, -7.0, 5.0])
 SUN = np.array([-.50, -.62, .60]) / np.linalg.norm([-.50, -.62, .60])   # left, behind the tourists
 STONE, PALE, SAND, BRICK, ROOF, SLATE, COPPER, GOLD, HOUSE, LEAF, PAVING, MEADOW = range(12)
-LOOKS = np.array([   # percent: colour, width and height of a cell, contrast of cells, has windows
-    (50, 46, 40, 29, 13, 20, 0), (80, 74, 60, 29, 13, 8, 0), (78, 56, 30, 30, 30, 15, 100),
-    (52, 19, 11, 30, 30, 15, 100), (60, 22, 12, 16, 8, 30, 0), (12, 19, 31, 20, 10, 25, 0),
-    (16, 46, 36, 50, 50, 40, 0), (90, 58, 8, 50, 50, 0, 0), (60, 46, 34, 62, 62, 15, 100),
-    (10, 22, 5, 20, 20, 45, 0), (48, 42, 34, 42, 42, 20, 0), (17, 22, 8, 60, 60, 10, 0)]) / 100
-# Part: |z| <= half around its centre, and its first `round` coordinates lie in a ball whose radius
-# runs from bottom to top: 1 a box or roof (its |y| <= depth), 2 a column or cone; 3 is a ball.
-LANDMARK = np.array([   # round; centre x y z, half, bottom, top, depth in thousandths; look
-    (1, -10, -30, 50, 50, 960, 960, 530, STONE), (1, -50, 0, 150, 50, 850, 850, 470, STONE),
-    *[(2, 0, -340, 470, 270, 62, 50, INF, PALE)] * 6, (1, 30, 200, 530, 330, 590, 590, 260, SAND),
-    (1, 30, 30, 800, 60, 670, 670, 460, PALE), (1, 30, 30, 980, 120, 710, 0, 480, ROOF),
-    (2, -50, 220, 1070, 170, 330, 310, INF, SAND), (3, -50, 220, 1240, 300, 300, 300, INF, COPPER),
-    (2, -50, 220, 1570, 70, 75, 65, INF, PALE), (2, -50, 220, 1700, 60, 100, 20, INF, COPPER),
-    (3, -50, 220, 1780, 45, 45, 45, INF, GOLD), (1, 870, 180, 530, 530, 170, 170, 170, BRICK),
-    (1, 870, 180, 1100, 40, 200, 200, 200, PALE), (2, 870, 180, 1320, 180, 200, 0, INF, SLATE),
-    (1, -760, 240, 380, 180, 190, 190, 250, BRICK), (1, -760, 240, 650, 90, 230, 0, 280, SLATE),
-    (1, -800, -350, 280, 80, 90, 90, 90, PALE), (2, -800, -350, 480, 120, 70, 40, INF, COPPER),
-    (3, -800, -350, 640, 55, 55, 55, INF, COPPER)]) / (1, *[1000] * 7, 1)
-LANDMARK[2:8, 1] = np.linspace(-.54, .60, 6)   # plinth, columns, hall; dome; tower; annex; statue
-TOWN = np.array([row for x, y, w, h in [   # houses, and a tree before each
-    (-7.5, 2.0, .6, 1.5), (-6.2, 4.4, .5, 1.1), (-4.0, 6.4, .8, 1.8), (-1.2, 7.6, .5, 2.3),
-    (2.0, 6.8, .7, 1.4), (4.6, 5.6, .5, 1.9), (6.8, 3.0, .6, 1.3), (7.4, 0.0, .5, 1.7)] for row in [
-        (1, x, y, h / 2, h / 2, w, w, w, HOUSE), (1, x, y, h + .25, .25, w, 0, w, SLATE),
-        (3, .8 * x + 1, .7 * y, .2 + .8 * w, .8 * w, .8 * w, .8 * w, INF, LEAF)]])
+WORDS = dict(box=1, column=2, ball=3, inf=np.inf, stone=STONE, pale=PALE, sand=SAND, brick=BRICK)
+WORDS.update(roof=ROOF, slate=SLATE, copper=COPPER, gold=GOLD)
+
+
+def table(text):
+    lines = text.strip().splitlines()
+    return np.array([[float(WORDS.get(word, word)) for word in line.split()] for line in lines])
+
+
+# Percent: colour, width and height of a cell, contrast of cells, has windows; a row a surface.
+LOOKS = table("""
+    50 46 40  29 13  20   0
+    80 74 60  29 13   8   0
+    78 56 30  30 30  15 100
+    52 19 11  30 30  15 100
+    60 22 12  16  8  30   0
+    12 19 31  20 10  25   0
+    16 46 36  50 50  40   0
+    90 58  8  50 50   0   0
+    60 46 34  62 62  15 100
+    10 22  5  20 20  45   0
+    48 42 34  42 42  20   0
+    17 22  8  60 60  10   0
+""") / 100
+# Shape; centre x y z, half height, radius at the bottom and at the top, depth in thousandths; look.
+# A box (or roof) has |x| <= radius and |y| <= depth. Plinth, columns, hall; dome; tower; annex;
+# statue.
+LANDMARK = table("""
+    box     -10  -30   50   50  960  960  530  stone
+    box     -50    0  150   50  850  850  470  stone
+    column    0 -340  470  270   62   50  inf  pale
+    column    0 -340  470  270   62   50  inf  pale
+    column    0 -340  470  270   62   50  inf  pale
+    column    0 -340  470  270   62   50  inf  pale
+    column    0 -340  470  270   62   50  inf  pale
+    column    0 -340  470  270   62   50  inf  pale
+    box      30  200  530  330  590  590  260  sand
+    box      30   30  800   60  670  670  460  pale
+    box      30   30  980  120  710    0  480  roof
+    column  -50  220 1070  170  330  310  inf  sand
+    ball    -50  220 1240  300  300  300  inf  copper
+    column  -50  220 1570   70   75   65  inf  pale
+    column  -50  220 1700   60  100   20  inf  copper
+    ball    -50  220 1780   45   45   45  inf  gold
+    box     870  180  530  530  170  170  170  brick
+    box     870  180 1100   40  200  200  200  pale
+    column  870  180 1320  180  200    0  inf  slate
+    box    -760  240  380  180  190  190  250  brick
+    box    -760  240  650   90  230    0  280  slate
+    box    -800 -350  280   80   90   90   90  pale
+    column -800 -350  480  120   70   40  inf  copper
+    ball   -800 -350  640   55   55   55  inf  copper
+""") / (1, *[1000] * 7, 1)
+LANDMARK[2:8, 1] = np.linspace(-.54, .60, 6)   # the columns stand in a row
+GROUPS = (2, 16), (11, 16), (16, 19), (19, 21), (21, 24)   # on the plinth; of it the dome; ...
+HOUSES = table("""
+    -7.5 2.0 .6 1.5
+    -6.2 4.4 .5 1.1
+    -4.0 6.4 .8 1.8
+    -1.2 7.6 .5 2.3
+     2.0 6.8 .7 1.4
+     4.6 5.6 .5 1.9
+     6.8 3.0 .6 1.3
+     7.4 0.0 .5 1.7
+""")   # x, y, half width, height
+
+
+def town():
+    """Parts of the background: houses with a roof, and a tree before each."""
+    parts = []
+    for x, y, w, h in HOUSES:
+        tree = .8 * w
+        parts.append((1, x, y, h / 2, h / 2, w, w, w, HOUSE))
+        parts.append((1, x, y, h + .25, .25, w, 0, w, SLATE))
+        parts.append((3, .8 * x + 1, .7 * y, .2 + tree, tree, tree, tree, np.inf, LEAF))
+    return np.array(parts)
 
 
 def toy_parts(landmark, background):
-    """(P,9): LANDMARK, for other numbers than 0 another building of such parts; then maybe TOWN."""
-    parts, rng = LANDMARK.copy(), np.random.default_rng([landmark, 1])
-    if landmark:   # stretch and move what is on the plinth; of it the dome; tower; annex; statue
-        for first, last in (2, 16), (11, 16), (16, 19), (19, 21), (21, 24):
-            group, size = parts[first:last], rng.uniform(.7, 1.2, 3)
-            foot = *group[:, 1:3].mean(0), group[0, 3] - group[0, 4]
-            group[:, 1:4] = foot + (group[:, 1:4] - foot) * size + (*rng.uniform(-.06, .06, 2), 0)
-            group[:, 4:8] *= np.where(group[:, :1] == 1, size[[2, 0, 0, 1]], size[2])
+    """(P,9): LANDMARK, for other numbers than 0 another building of such parts; then maybe a town."""
+    parts = LANDMARK.copy()
+    if landmark:
+        rng = np.random.default_rng([landmark, 1])
+        for first, last in GROUPS:   # stretch and move
+            group = parts[first:last]
+            size = rng.uniform(.7, 1.2, 3)
+            shift = np.append(rng.uniform(-.06, .06, 2), 0)
+            foot = np.append(group[:, 1:3].mean(0), group[0, 3] - group[0, 4])
+            group[:, 1:4] = foot + (group[:, 1:4] - foot) * size + shift
+            is_box = group[:, :1] == 1   # others stay round
+            group[:, 4:8] *= np.where(is_box, size[[2, 0, 0, 1]], size[2])
         parts[:, 1] *= rng.choice((-1, 1))
-        looks = *rng.permutation(2), *rng.permutation(2) + SAND, *rng.permutation(3) + ROOF, GOLD
+        looks = [*rng.permutation(2), *SAND + rng.permutation(2), *ROOF + rng.permutation(3), GOLD]
         parts[:, 8] = np.take(looks, parts[:, 8].astype(int))
-    return np.concatenate([parts, TOWN]) if background else parts
+    if background:
+        parts = np.concatenate([parts, town()])
+    return parts
 
 
 def part_sdf(part, x):
     """Distance to one part (9,), or to one part for each point (P,9). x (P,3) -> (P,)"""
-    p, (n, half, bottom, top, depth) = x - part[..., 1:4], part.T[[0, 4, 5, 6, 7]]
-    u, z = np.where(n == 1, np.abs(p[:, 0]), np.hypot(p[:, 0], p[:, 1])), p[:, 2]
-    grow, tall = top - bottom, 2 * half   # the slanted side, from bottom to top
-    k = np.clip(((u - bottom) * grow + (z + half) * tall) / (grow ** 2 + tall ** 2), 0, 1)
+    p = x - part[..., 1:4]
+    shape, half, bottom, top, depth = part.T[[0, 4, 5, 6, 7]]
+    z = p[:, 2]
+    u = np.where(shape == 1, np.abs(p[:, 0]), np.hypot(p[:, 0], p[:, 1]))
+    # In the plane of u and z: the slanted side from bottom to top, and the caps.
+    grow = top - bottom
+    tall = 2 * half
+    k = ((u - bottom) * grow + (z + half) * tall) / (grow ** 2 + tall ** 2)
+    k = np.clip(k, 0, 1)
     side = np.hypot(u - bottom - k * grow, z + half - k * tall)
-    cap = np.hypot(np.maximum(u - np.where(z < 0, bottom, top), 0), np.abs(z) - half)
+    width = np.where(z < 0, bottom, top)
+    cap = np.hypot(np.maximum(u - width, 0), np.abs(z) - half)
     inside = (np.abs(z) < half) & (u < bottom + grow * (z + half) / tall)
-    d, e = np.where(inside, -1, 1) * np.minimum(side, cap), np.abs(p[:, 1]) - depth   # e: or -inf
+    d = np.where(inside, -1, 1) * np.minimum(side, cap)
+    e = np.abs(p[:, 1]) - depth   # -inf for a column
     d = np.hypot(np.maximum(d, 0), np.maximum(e, 0)) + np.minimum(np.maximum(d, e), 0)
-    return np.where(n == 3, np.hypot(u, z) - bottom, d)
+    return np.where(shape == 3, np.hypot(u, z) - bottom, d)
 
 
 def toy_sdf(x_world, background=True, landmark=0):
     """Signed distance of the toy, + and exact outside, SfM units. (P,3) -> (P,) float64"""
     x = (np.asarray(x_world, np.float64) - TOY_ORIGIN) / TOY_SCALE
-    parts = [part_sdf(part, x) for part in toy_parts(landmark, background)]
-    return np.min([*parts, x[:, 2]] if background else parts, axis=0) * TOY_SCALE
+    distances = [part_sdf(part, x) for part in toy_parts(landmark, background)]
+    if background:
+        distances.append(x[:, 2])   # the ground
+    return np.min(distances, axis=0) * TOY_SCALE
+
+
+def enter_part(part, o, d):
+    """Where rays o, d (R,3), seen from the part's centre, enter it; inf for a miss. -> (R,)
+
+    A part is where a quadric and up to two slabs overlap: a ray is inside between the last
+    entrance and the first exit."""
+    shape, *_, half, bottom, top, depth, _ = part
+    n = int(shape)   # the quadric is round in the first n coordinates
+    grow = (top - bottom) / half / 2
+    rise = grow * d[:, 2]
+    w = (bottom + top) / 2 + grow * o[:, 2]   # radius at the ray's start
+    a = (d[:, :n] ** 2).sum(1) - rise ** 2
+    b = (d[:, :n] * o[:, :n]).sum(1) - rise * w
+    c = (o[:, :n] ** 2).sum(1) - w * w
+    root = np.sqrt(b * b - a * c)   # nan for a miss
+    is_cone = a < 0   # such a ray is inside on one end, for ever
+    enter = np.where(is_cone & (rise < 0), -np.inf, (-b - root) / a)
+    leave = np.where(is_cone & (rise > 0), np.inf, (-b + root) / a)
+    for axis in range(n, 3):
+        middle = -o[:, axis] / d[:, axis]
+        reach = np.abs((depth, half)[axis - 1] / d[:, axis])
+        enter = np.maximum(enter, middle - reach)
+        leave = np.minimum(leave, middle + reach)
+    return np.where((enter < leave) & (enter > 0), enter, np.inf)
 
 
 @np.errstate(divide="ignore", invalid="ignore")
 def trace(o, d, parts, ground):
-    """First hits of rays, closed form: distance (R,), inf is sky, and part (R,), -1 is the ground.
-    A part is where a quadric and up to two slabs overlap; its hit is where the last one begins."""
-    t = np.where(ground & (d[:, 2] < -1e-3), -o[:, 2] / d[:, 2], INF)   # (R,)
-    which, centre = np.full(len(d), -1), parts[:, 1:4]
-    along = centre @ d.T - (o * d).sum(1)   # (P,R), bounding spheres first
+    """First hits of rays: distance (R,), inf is sky, and part (R,), -1 is the ground."""
+    t = np.where(ground & (d[:, 2] < -1e-3), -o[:, 2] / d[:, 2], np.inf)   # (R,)
+    which = np.full(len(d), -1)
+    centre = parts[:, 1:4]
+    along = centre @ d.T - (o * d).sum(1)   # (P,R)
     aside = (centre ** 2).sum(1)[:, None] - 2 * centre @ o.T + (o * o).sum(1) - along ** 2
-    for i, (n, *_, half, bottom, top, depth, _) in enumerate(parts):
-        n, grow = int(n), (top - bottom) / half / 2
-        radius = np.linalg.norm((max(bottom, top), half * (n < 3), depth if n == 1 else 0))
+    for i, (shape, *_, half, bottom, top, depth, _) in enumerate(parts):
+        extent = max(bottom, top), half * (shape < 3), depth if shape == 1 else 0
+        radius = np.linalg.norm(extent)   # of the bounding sphere
         rows = np.flatnonzero((aside[i] < radius ** 2) & (np.abs(along[i]) < radius + t))
-        p, v = o[rows] - centre[i], d[rows]
-        w, rise = (bottom + top) / 2 + grow * p[:, 2], grow * v[:, 2]
-        a, b = (v[:, :n] ** 2).sum(1) - rise ** 2, (v[:, :n] * p[:, :n]).sum(1) - rise * w
-        root = np.sqrt(b * b - a * ((p[:, :n] ** 2).sum(1) - w * w))   # nan for a miss
-        enter = np.where((a < 0) & (rise < 0), -INF, (-b - root) / a)   # a < 0: a cone, open at
-        leave = np.where((a < 0) & (rise > 0), INF, (-b + root) / a)   # one end
-        for axis in range(n, 3):
-            reach = np.abs((depth, half)[axis - 1] / v[:, axis])
-            enter = np.maximum(enter, -p[:, axis] / v[:, axis] - reach)
-            leave = np.minimum(leave, -p[:, axis] / v[:, axis] + reach)
-        hit = (enter < leave) & (enter > 0) & (enter < t[rows])
-        t[rows[hit]], which[rows[hit]] = enter[hit], i
+        enter = enter_part(parts[i], o[rows] - centre[i], d[rows])
+        hit = enter < t[rows]
+        t[rows[hit]] = enter[hit]
+        which[rows[hit]] = i
     return t, which
 
 
-def shade(o, d, parts, background):
-    """Radiance along rays: sun, shadow, sky light and haze. o, d (R,3) -> (R,3) linear"""
-    up, azimuth = d[:, 2:], np.arctan2(d[:, :1], d[:, 1:2])
+def sky(d):
+    """Radiance of the sky and two ranges of hills. d (R,3) -> (R,3) linear"""
+    up = d[:, 2:]
+    azimuth = np.arctan2(d[:, :1], d[:, 1:2])
     colour = (.58, .68, .78) + np.clip(up * 1.5, 0, 1) * (-.52, -.46, -.26)
-    for base, size, waves, hill in (.11, .045, 5, (.25, .33, .45)), (.06, .03, 9, (.11, .18, .16)):
+    far_hills = .11, .045, 5, (.25, .33, .45)
+    near_hills = .06, .03, 9, (.11, .18, .16)
+    for base, size, waves, hill in (far_hills, near_hills):
         ridge = np.sin(waves * azimuth + base * 40) + 0.6 * np.sin(2.3 * waves * azimuth)
         colour = np.where(up < base + size * ridge, hill, colour)
-    colour *= background
-    t, which = trace(o, d, parts, background)
-    hit = np.flatnonzero(t < INF)
-    x, floor, part = o[hit] + t[hit, None] * d[hit], which[hit] < 0, parts[which[hit]]   # (R,9)
-    normal = np.stack([part_sdf(part, x + e) - part_sdf(part, x - e) for e in 1e-5 * np.eye(3)], 1)
-    normal = np.where(floor[:, None], (0, 0, 1), normal / 2e-5)
-    turn = np.arctan2(x[:, 1] - part[:, 2], x[:, 0] - part[:, 1])
-    across = np.where(floor, x[:, 0], np.where(part[:, 0] == 1, x[:, 0] + x[:, 1], turn))
+    return colour
+
+
+def paint(x, part, is_ground):
+    """Solid texture of cells at points of the surface: x (H,3), part (H,9) -> (H,3)"""
     square = np.where(np.hypot(x[:, 0], x[:, 1]) < 2.6, PAVING, MEADOW)
-    look = LOOKS[np.where(floor, square, part[:, 8]).astype(int)]
-    row = np.where(floor, x[:, 1], x[:, 2]) / look[:, 4]   # solid texture of cells; without
-    column = across / look[:, 3] + (np.floor(row) % 2 / 2) * (1 - look[:, 6])   # windows, a bond
-    chance = np.abs(np.sin(12.9898 * np.floor(column) + 78.233 * np.floor(row))) * 437.585 % 1
-    dark = look[:, 6] * (np.abs(column % 1 - .5) < .2) * (np.abs(row % 1 - .45) < .28)
-    paint = look[:, :3] * ((1 + look[:, 5] * (2 * chance - 1)) * (1 - .8 * dark))[:, None]
-    shadow = trace(x + 1e-4 * normal, np.broadcast_to(SUN, x.shape), parts, background)[0] < INF
-    light = (np.clip(normal @ SUN, 0, None) * ~shadow)[:, None] * (1.15, 1.05, .88)
+    look = LOOKS[np.where(is_ground, square, part[:, 8]).astype(int)]
+    colour, width, height, contrast, windows = np.split(look, [3, 4, 5, 6], axis=1)
+    turn = np.arctan2(x[:, 1] - part[:, 2], x[:, 0] - part[:, 1])
+    across = np.where(part[:, 0] == 1, x[:, 0] + x[:, 1], turn)
+    across = np.where(is_ground, x[:, 0], across)
+    row = np.where(is_ground, x[:, 1], x[:, 2])[:, None] / height
+    bond = (np.floor(row) % 2 / 2) * (1 - windows)   # every other row of stones is shifted
+    column = across[:, None] / width + bond
+    seed = 12.9898 * np.floor(column) + 78.233 * np.floor(row)
+    chance = np.abs(np.sin(seed)) * 437.585 % 1
+    is_window = (np.abs(column % 1 - .5) < .2) * (np.abs(row % 1 - .45) < .28)
+    dark = windows * is_window
+    return colour * ((1 + contrast * (2 * chance - 1)) * (1 - .8 * dark))
+
+
+def shade(o, d, parts, background, sun):
+    """Radiance along rays: sun, shadow, sky light and haze. o, d (R,3), sun (3,) -> (R,3) linear"""
+    colour = sky(d) * background
+    t, which = trace(o, d, parts, background)
+    hit = np.flatnonzero(t < np.inf)
+    x = o[hit] + t[hit, None] * d[hit]
+    part = parts[which[hit]]   # (H,9)
+    is_ground = which[hit] < 0
+    steps = 1e-5 * np.eye(3)
+    normal = np.stack([part_sdf(part, x + e) - part_sdf(part, x - e) for e in steps], 1) / 2e-5
+    normal = np.where(is_ground[:, None], (0, 0, 1), normal)
+    to_sun = np.broadcast_to(sun, x.shape)
+    in_sun = trace(x + 1e-4 * normal, to_sun, parts, background)[0] == np.inf
+    light = (np.clip(normal @ sun, 0, None) * in_sun)[:, None] * (1.15, 1.05, .88)
     light += (0.20 + 0.10 * normal[:, 2:]) * (.8, .92, 1.15)
     haze = np.exp(-np.maximum(t[hit, None] - 5, 0) / 20)
-    colour[hit] = haze * paint * light + (1 - haze) * (.42, .50, .58)
+    colour[hit] = haze * paint(x, part, is_ground) * light + (1 - haze) * (.42, .50, .58)
     return colour
 
 
@@ -237,311 +404,695 @@ def project(K, c2w, x):
     """Pixels (P,2), -1e9 behind the camera, and distances (P,) of points x (P,3)."""
     p = (x - c2w[:, 3]) @ c2w[:, :3]
     z = np.where(p[:, 2:] > 1 / FAR, p[:, 2:], np.nan)
-    return np.nan_to_num(p[:, :2] / z * K[:2] + K[2:], nan=-1e9), np.linalg.norm(p, axis=1)
+    uv = p[:, :2] / z * K[:2] + K[2:]
+    return np.nan_to_num(uv, nan=-1e9), np.linalg.norm(p, axis=1)
 
 
 def toy_camera(rng, azimuth, size):
     """A tourist at `azimuth` [rad] from the front. -> K (4,), c2w (3,4) in the toy's units, w, h"""
     aspect = rng.choice([4 / 3, 3 / 2, 1.1, 3 / 4, 2 / 3])
     w, h = np.round(size * np.minimum((aspect, 1), (1, 1 / aspect))).astype(int)
-    f = size / 2 / np.tan(np.radians(rng.uniform(40, 65)) / 2)
+    angle = np.radians(rng.uniform(40, 65))   # of view, along the long side
+    f = size / 2 / np.tan(angle / 2)
     target = (0, .05, .80) + rng.uniform(-.12, .12, 3)
     away = np.array([np.sin(azimuth), -np.cos(azimuth), rng.uniform(-.15, .45)])
-    eye = target + away * f / min(w, h) * rng.uniform(2.0, 2.6) * rng.choice((0.8, 1), p=(.1, .9))
+    away = away * f / min(w, h) * rng.uniform(2.0, 2.6)
+    eye = target + away * rng.choice((0.8, 1), p=(.1, .9))
     eye[2] = max(eye[2], 0.2)
     z = (target - eye) / np.linalg.norm(target - eye)
-    x = np.cross(z, (*rng.normal(0, .03, 2), 1))   # hardly anyone holds it level
+    lean = rng.normal(0, .03, 2)   # hardly anyone holds it level
+    x = np.cross(z, (*lean, 1))
     x /= np.linalg.norm(x)
-    return np.array([f, f, w / 2, h / 2]), np.stack([x, np.cross(z, x), z, eye], 1), w, h
+    c2w = np.stack([x, np.cross(z, x), z, eye], 1)
+    return np.array([f, f, w / 2, h / 2]), c2w, w, h
 
 
 def draw_people(rng, w, h, share):
     """Passers-by on about `share` of the photo. -> (h*w,4): colour times opacity, opacity"""
     canvas = np.zeros((4 * h, 4 * w, 4), np.float32)   # drawn large, then averaged
-    while (left := share - canvas[..., 3].mean()) > max(0.1 * share, 0.002):
-        tall = 4 * np.clip(np.sqrt(left * w * h / .25) * rng.uniform(.5, 1), .12 * h, .95 * h)
+    while True:
+        left = share - canvas[..., 3].mean()
+        if left <= max(0.1 * share, 0.002):
+            break
+        tall = np.sqrt(left * w * h / .25) * rng.uniform(.5, 1)
+        tall = 4 * np.clip(tall, .12 * h, .95 * h)
         feet = rng.uniform((0, 3.2 * h), (4 * w, 4 * h + .2 * tall))
         coat, legs, thing, skin = .02 + .83 * rng.beta(.4, .4, (4, 3))   # vivid, black or white
-        stripe, belts = thing if rng.random() < .4 else coat, np.arange(.5, .75, .06)
+        skin = (.3 + skin[0]) * np.array([.8, .6, .45])
+        stripe = thing if rng.random() < .4 else coat
         spot = rng.uniform((-.25, .5), (.25, 1.15))   # of a bag, balloon or hat
-        for colour, *ends, wide in [
-                (legs, -.06, .03, -.06, .45, .1), (legs, .06, .03, .06, .45, .1),
-                *[((coat, stripe)[i % 2], -.05, y, .05, y, .16) for i, y in enumerate(belts)],
-                ((.3 + skin[0]) * np.array([.8, .6, .45]), 0, .92, 0, .92, .15),
-                (thing, *spot, *(spot + rng.uniform(-.15, .15, 2)), rng.uniform(.08, .25))]:
-            ends = (feet + np.reshape(ends, (2, 2)) * (tall, -tall)).astype(int).tolist()
-            cv2.line(canvas, *ends, (*colour.tolist(), 1), int(wide * tall) + 1)
-    return cv2.resize(canvas, (w, h), interpolation=cv2.INTER_AREA).reshape(-1, 4).astype(float)
+        # Strokes: colour, both ends x y and width, in heights of the person above the feet.
+        strokes = [(legs, -.06, .03, -.06, .45, .1), (legs, .06, .03, .06, .45, .1)]
+        for i, y in enumerate(np.arange(.5, .75, .06)):
+            strokes.append(((coat, stripe)[i % 2], -.05, y, .05, y, .16))
+        strokes.append((skin, 0, .92, 0, .92, .15))
+        end = spot + rng.uniform(-.15, .15, 2)
+        strokes.append((thing, *spot, *end, rng.uniform(.08, .25)))
+        for colour, x0, y0, x1, y1, wide in strokes:
+            ends = feet + np.array([(x0, y0), (x1, y1)]) * (tall, -tall)
+            thickness = int(wide * tall) + 1
+            cv2.line(canvas, *ends.astype(int).tolist(), (*colour.tolist(), 1), thickness)
+    small = cv2.resize(canvas, (w, h), interpolation=cv2.INTER_AREA)
+    return small.reshape(-1, 4).astype(float)
 
 
 def toy_points(rng, views, depths, people, count=3000):
     """As by SfM: noisy, 1.5 % wrong. -> points (K,5) as in finish, and those (M,) of each photo"""
-    x, tracks, views = [], [], [*zip(views, depths, people)]
-    for (K, c2w, w, h), depth, hidden in views:
+    x = []
+    for (K, c2w, w, h), depth, hidden in zip(views, depths, people):
         surface = c2w[:, 3] + rays(K, c2w, w, h) * depth[:, None]
         ok = (depth < 30) & ~hidden
-        on = ok & (surface[:, 2] > .02) & (np.abs(surface[:, :2]) < 1.3).all(1)
+        on = ok & (surface[:, 2] > .02) & (np.abs(surface[:, :2]) < 1.3).all(1)   # the landmark
         for some, n in (on, count // len(views)), (ok & ~on, count // 5 // len(views)):
             x.append(surface[rng.choice(np.flatnonzero(some), n * some.any())])
     x = np.concatenate(x)
-    for (K, c2w, w, h), depth, hidden in views:
+    tracks = []
+    for (K, c2w, w, h), depth, hidden in zip(views, depths, people):
         uv, distance = project(K, c2w, x)
         at = np.clip(uv, 0, (w - 1, h - 1)).astype(int) @ (1, w)
-        ok = ((uv >= 0) & (uv < (w, h))).all(1) & (np.abs(depth[at] / distance - 1) < .02)
-        tracks.append(np.flatnonzero(ok & ~hidden[at] & (rng.random(len(x)) < .6)))
-    x += (rng.random((len(x), 1)) < .015) * rng.uniform(-1, 1, x.shape)
+        ok = ((uv >= 0) & (uv < (w, h))).all(1)
+        ok &= np.abs(depth[at] / distance - 1) < .02
+        ok &= ~hidden[at] & (rng.random(len(x)) < .6)
+        tracks.append(np.flatnonzero(ok))
+    is_wrong = rng.random((len(x), 1)) < .015
+    x += is_wrong * rng.uniform(-1, 1, x.shape)
     x = (x + rng.normal(0, .005, x.shape)) * TOY_SCALE + TOY_ORIGIN
-    views = np.bincount(np.concatenate(tracks), minlength=len(x))
-    return np.column_stack([x, 0 * views, views]), tracks
+    counts = np.bincount(np.concatenate(tracks), minlength=len(x))
+    return np.column_stack([x, 0 * counts, counts]), tracks
+
+
+def turn_sun(degrees):
+    """The sun, its azimuth turned."""
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    return np.array([c * SUN[0] - s * SUN[1], s * SUN[0] + c * SUN[1], SUN[2]])
+
+
+def shake_camera(rng, K, c2w, pixels):
+    """Moves c2w, in the toy's units, by noise that is `pixels` rms at the landmark."""
+    *turn, dx, dy = rng.normal(0, pixels / 2, 4) / K[0]   # half by turning, half by moving [rad]
+    c2w[:, 3] += c2w[:, :2] @ (dx, dy) * np.linalg.norm(c2w[:, 3])
+    c2w[:, :3] = c2w[:, :3] @ cv2.Rodrigues(np.array([*turn, 0]))[0]
 
 
 def make_toy(seed=0, size=96, photos=48, test=8, occluders=0.05, exposure=1.0, pose_noise=0.0,
-             background=True, landmark=0):
+             background=True, landmark=0, sun=0.0):
     """Scene of a procedural landmark, the same for every seed, another for every number. size: long
     side [px]. occluders: mean share of a training photo that people cover, 0..0.6. exposure: spread
     of brightness, white balance and contrast, 0 none, 1 tourists, 2 extreme. pose_noise: of the
-    training photos [px rms at the landmark]. background=False: nothing else, before black."""
-    info = dict(scene="toy", kind="toy", downscale=1, folder=None, split=None) | locals()
-    need(0 <= occluders <= 0.6 and 0 <= exposure <= 2 and min(size / 16, photos / 4) >= 1
-         and min(test, seed, landmark) >= 0 and 0 <= pose_noise < INF, "the toy needs occluders in "
-         "0..0.6, exposure in 0..2, size >= 16, photos >= 4, and no other number below 0")
-    camera, taste, people, sfm, shake = (np.random.default_rng([seed, k]) for k in range(5))
-    count = photos + test   # a stream each: no knob moves another
+    training photos [px rms at the landmark]. background=False: nothing else, before black. sun: its
+    azimuth differs from photo to photo by up to this many degrees."""
+    knobs = dict(locals())
+    info = dict(scene="toy", kind="toy", downscale=1, folder=None, split=None)
+    info.update(knobs)
+    rule = "the toy needs occluders in 0..0.6, exposure in 0..2, sun in 0..180, size >= 16, "
+    rule += "photos >= 4, and no other number below 0"
+    check(0 <= occluders <= 0.6 and 0 <= exposure <= 2 and 0 <= sun <= 180, rule)
+    check(size >= 16 and photos >= 4 and 0 <= pose_noise < np.inf, rule)
+    check(min(test, seed, landmark) >= 0, rule)
+    streams = [np.random.default_rng([seed, k]) for k in range(6)]   # no knob moves another
+    camera, taste, people, sfm, shake, day = streams
+    count = photos + test
     angles = 200 * (np.arange(count) + camera.uniform(.1, .9, count)) / count - 100
     views = [toy_camera(camera, angle, size) for angle in np.radians(angles)]
     is_test = np.isin(np.arange(count), (np.arange(test) + 0.5) * count // max(test, 1))
     share = people.gamma(0.8 + 6 * occluders, size=count) * ~is_test   # some photos stay free
     share = np.minimum(share / share.sum() * photos * occluders, 0.85)
-    parts, images, depth, occluder = toy_parts(landmark, background), [], [], []
-    for (K, c2w, w, h), cover in zip(tell(views, "drawing photos"), share):
-        o, tint = np.broadcast_to(c2w[:, 3], (w * h, 3)), exposure * taste.uniform(-1, 1, 4)
-        linear = sum(np.clip(shade(o, rays(K, c2w, w, h, dx, dy), parts, background), 0, 1)
-                     for dx in (.25, .75) for dy in (.25, .75)) / 4
-        cover = draw_people(people, w, h, cover)
-        linear = linear * (1 - cover[:, 3:]) + cover[:, :3]   # (h*w,3)
-        gain = 2 ** (tint[0] / 2) * (1 + .1 * tint[1:3] @ [[1, 0, 0], [0, 0, 1]])
-        srgb = np.clip(linear * gain, 0, 1) ** (1.2 ** tint[3] / 2.2)
+    suns = [turn_sun(sun * turn) for turn in day.uniform(-1, 1, count)]
+    parts = toy_parts(landmark, background)
+    images, depth, occluder = [], [], []
+    for i in progress(range(count), "drawing photos"):
+        K, c2w, w, h = views[i]
+        o = np.broadcast_to(c2w[:, 3], (w * h, 3))
+        linear = 0
+        for dx, dy in itertools.product((.25, .75), repeat=2):
+            radiance = shade(o, rays(K, c2w, w, h, dx, dy), parts, background, suns[i])
+            linear = linear + np.clip(radiance, 0, 1)
+        cover = draw_people(people, w, h, share[i])
+        linear = linear / 4 * (1 - cover[:, 3:]) + cover[:, :3]   # (h*w,3)
+        tint = exposure * taste.uniform(-1, 1, 4)
+        balance = 1 + .1 * tint[1:3] @ [[1, 0, 0], [0, 0, 1]]   # of red and blue
+        bright = np.clip(linear * (2 ** (tint[0] / 2) * balance), 0, 1)
+        srgb = bright ** (1.2 ** tint[3] / 2.2)
         images.append((srgb * 255 + 0.5).astype(np.uint8).reshape(h, w, 3))
         depth.append(trace(o, rays(K, c2w, w, h), parts, background)[0])
         occluder.append(cover[:, 3] > 0)
     points, tracks = toy_points(sfm, views, depth, occluder)
-    for (K, c2w, *_), test in zip(views, is_test):   # half by turning, half by moving [rad]
-        *turn, dx, dy = shake.normal(0, pose_noise / 2, 4) / K[0] * ~test
-        c2w[:, 3] += c2w[:, :2] @ (dx, dy) * np.linalg.norm(c2w[:, 3])
-        c2w[:, :3] = c2w[:, :3] @ cv2.Rodrigues(np.array([*turn, 0]))[0]
+    for (K, c2w, *_), held_out in zip(views, is_test):
+        shake_camera(shake, K, c2w, pose_noise * (not held_out))
         c2w[:, 3] = c2w[:, 3] * TOY_SCALE + TOY_ORIGIN
-    parts = parts[:len(LANDMARK)]   # all of it belongs in the unit sphere
-    extent = np.where(parts[:, [5, 7, 4]] < INF, parts[:, [5, 7, 4]], parts[:, [5]])
-    corners = [parts[:, 1:4] + extent * c for c in itertools.product((-1, 1), repeat=3)]
+    building = parts[:len(LANDMARK)]   # all of it belongs in the unit sphere
+    radius, depth_y, half = building[:, [5]], building[:, [7]], building[:, [4]]
+    extent = np.hstack([radius, np.where(depth_y < np.inf, depth_y, radius), half])
+    corners = [building[:, 1:4] + extent * signs for signs in itertools.product((-1, 1), repeat=3)]
     contain = np.concatenate(corners) * TOY_SCALE + TOY_ORIGIN
-    (K, c2w, *_), name = zip(*views), [f"toy_{i:03d}.png" for i in range(count)]
+    K, c2w, *_ = zip(*views)
+    name = [f"toy_{i:03d}.png" for i in range(count)]
     scene = finish(images, K, c2w, is_test, name, points, tracks, info, contain)
     depth = np.concatenate(depth) * TOY_SCALE / scene["scale"]
-    return scene | dict(depth=depth.astype(np.float16), occluder=np.concatenate(occluder))
+    scene["depth"] = depth.astype(np.float16)
+    scene["occluder"] = np.concatenate(occluder)
+    return scene
 
 
-def finish(images, K, c2w, is_test, name, points, tracks, info, contain=()):
-    """The scene of images (h,w,3), each of which observes the points tracks (M,). SfM units: c2w;
-    points (K,5): x y z, error [px], views; contain (P,3). Unit sphere: geometric median of points
-    by views, 1.1 x the distance of 95 %; contain; 30 % of 9 in 10 training photos' own. [D10]"""
-    error, views, rng = points[:, 3], points[:, 4], np.random.default_rng(0)
+# ---- from photos, poses and points to a scene ----------------------------------------------------
+def choose_points(points):
+    """Which (K,) of the points are seen often enough and lie exactly enough."""
+    error, views = points[:, 3], points[:, 4]
     usable = views >= (3 if (views >= 3).sum() >= 500 else 2)
-    need(usable.sum() >= 20, f"{usable.sum()} usable 3D points: SfM needs more overlapping photos")
-    usable &= error <= np.quantile(error[usable], 0.95)
-    share, new = 2e6 / (1 + sum(map(len, tracks))), np.cumsum(usable) - 1   # 2 million are plenty
-    tracks = [new[own[usable[own] & (rng.random(len(own)) < share)]] for own in tracks]
-    x, weight = points[usable, :3], np.minimum(views[usable], 20).astype(int)
+    check(usable.sum() >= 20, f"{usable.sum()} usable 3D points: SfM needs more overlapping photos")
+    return usable & (error <= np.quantile(error[usable], 0.95))
+
+
+def find_sphere(x, weight, tracks, is_test, contain=()):
+    """Centre (3,) and radius of what most photos look at; its definition is [D10].
+
+    Centre: geometric median of points x (K,3) by weight. Radius: 1.1 x the distance of 95 %. If that
+    is a skyline, more than four times the median distance away, only nearer points are counted.
+    Inside are at least 30 % of the points (M,) of most training photos, and contain (P,3)."""
     centre = np.median(x, axis=0)
     for _ in range(20):   # Weiszfeld
         w = weight / np.maximum(np.linalg.norm(x - centre, axis=1), 1e-9)
         centre = w @ x / w.sum()
     distance = np.linalg.norm(x - centre, axis=1)   # (K,)
-    radius = 1.1 * np.quantile(np.repeat(distance, weight), 0.95, method="inverted_cdf")
-    training = [own for own, test in zip(tracks, is_test) if len(own) and not test]
-    need(training, "no training photo observes a usable 3D point: they do not belong together")
-    reach = np.quantile([np.quantile(distance[own], 0.3) for own in training], 0.9)
+    counted = np.repeat(distance, weight)
+    limit = 4 * np.median(counted)
+    if np.quantile(counted, 0.95) > limit:
+        counted = counted[counted <= limit]
+    radius = 1.1 * np.quantile(counted, 0.95, method="inverted_cdf")
+    training = [own for own, held_out in zip(tracks, is_test) if len(own) and not held_out]
+    check(training, "no training photo observes a usable 3D point: they do not belong together")
+    reach = np.median([np.quantile(distance[own], 0.3) for own in training])
     corners = np.linalg.norm(np.reshape(contain, (-1, 3)) - centre, axis=1)
     radius = max(radius, reach, *1.02 * corners)
-    need(radius > 1 / FAR, "all 3D points coincide: run SfM again")
+    check(radius > 1 / FAR, "all 3D points coincide: run SfM again")
+    return centre, radius
+
+
+def finish(images, K, c2w, is_test, name, points, tracks, info, contain=()):
+    """The scene of images (h,w,3), each of which observes the points tracks (M,). SfM units: c2w;
+    points (K,5): x y z, error [px], views; contain (P,3)."""
+    usable = choose_points(points)
+    share = 2e6 / (1 + sum(map(len, tracks)))   # two million observations are plenty
+    rng = np.random.default_rng(0)
+    new_index = np.cumsum(usable) - 1
+    kept = []
+    for own in tracks:
+        own = own[usable[own] & (rng.random(len(own)) < share)]
+        kept.append(new_index[own])
+    x = points[usable, :3]
+    weight = np.minimum(points[usable, 4], 20).astype(int)
+    centre, radius = find_sphere(x, weight, kept, is_test, contain)
     c2w = np.array(c2w)
     c2w[:, :, 3] = (c2w[:, :, 3] - centre) / radius
     arrays = dict(
-        rgb=np.concatenate([image.reshape(-1, 3) for image in images]), K=K, c2w=c2w, name=name,
-        wh=[image.shape[1::-1] for image in images], is_test=is_test, center=centre, scale=radius,
-        start=np.cumsum([0, *(image.size // 3 for image in images)]), info=json.dumps(info),
-        track_photo=np.repeat(np.arange(len(c2w)), [len(own) for own in tracks]),
-        track_point=np.concatenate(tracks), points=(x - centre) / radius)
-    return statistics({k: np.asarray(v, FORMAT[k].split()[0]) for k, v in arrays.items()})
+        rgb=np.concatenate([image.reshape(-1, 3) for image in images]),
+        wh=[image.shape[1::-1] for image in images],
+        start=np.cumsum([0, *(image.size // 3 for image in images)]),
+        K=K, c2w=c2w, is_test=is_test, name=name, info=json.dumps(info),
+        points=(x - centre) / radius, center=centre, scale=radius,
+        track_photo=np.repeat(np.arange(len(c2w)), [len(own) for own in kept]),
+        track_point=np.concatenate(kept))
+    scene = {key: np.asarray(value, FORMAT[key].split()[0]) for key, value in arrays.items()}
+    return statistics(scene)
 
 
 def statistics(scene):
-    """Adds what geonvs.py decides by. track_photo (sorted) sees track_point at track_uv (T,2), over
-    wh, if in 0..1. near (I,): 0.8 x the 2 % quantile of their distances, >= 0.02. Of the training
-    photos: footprint, lower quartile of a pixel's size at points in the sphere; exposure_spread,
-    deviation of brightness (0..1) at equal points; bg_color (3,), beyond; NaN unless 60 % agree."""
-    K, c2w, wh, start, rgb, points = (scene[k] for k in "K c2w wh start rgb points".split())
+    """Adds what geonvs.py decides by. near (I,): 0.8 x the 2 % quantile of the distances of a
+    photo's points, >= 0.02. Of the training photos: footprint, lower quartile of a pixel's size at
+    points in the sphere; exposure_spread, deviation of brightness (0..1) at equal points; bg_color
+    (3,), beyond the sphere; NaN unless 60 % agree."""
+    K, c2w, wh, rgb = scene["K"], scene["c2w"], scene["wh"], scene["rgb"]
+    points = scene["points"].astype(float)
     ends = np.searchsorted(scene["track_photo"], np.arange(1, len(wh)))
-    step, near, places, rows = max(1, len(rgb) // 500_000), [], [], []
-    for i, own in enumerate(np.split(scene["track_point"], ends)):
-        uv, distance = project(K[i], c2w[i], points[own].astype(float))
+    tracks = np.split(scene["track_point"], ends)
+    step = max(1, len(rgb) // 500_000)
+    near, places = [], []   # of all photos
+    seen, size, bright, beyond = [], [], [], []   # of the training photos
+    for i, own in enumerate(tracks):
+        uv, distance = project(K[i], c2w[i], points[own])
         places.append(np.clip(uv / wh[i], -1, 2))
         near.append(max(0.8 * np.quantile(distance, 0.02), 0.02) if len(own) else 0.05)
-        if not scene["is_test"][i]:
-            photo, (u, v) = rgb[start[i]:start[i + 1]], np.clip(uv, 0, wh[i] - 1).astype(int).T
-            o, d = c2w[i, :, 3], rays(K[i], c2w[i], *wh[i])
-            closest = o - np.minimum(d @ o, 0)[:, None] * d   # to the centre, along each ray
-            rows.append((own, distance / K[i, 0], photo[v * wh[i, 0] + u].mean(1) / 255,
-                         photo[np.linalg.norm(closest, axis=1) > 1][::step]))
-    seen, size, bright, beyond = zip(*rows)
-    every, size, beyond = map(np.concatenate, (seen, size, beyond))
+        if scene["is_test"][i]:
+            continue
+        photo = rgb[scene["start"][i]:scene["start"][i + 1]]
+        u, v = np.clip(uv, 0, wh[i] - 1).astype(int).T
+        seen.append(own)
+        size.append(distance / K[i, 0])
+        bright.append(photo[v * wh[i, 0] + u].mean(1) / 255)
+        o, d = c2w[i, :, 3], rays(K[i], c2w[i], *wh[i])
+        closest = o - np.minimum(d @ o, 0)[:, None] * d   # to the centre, along each ray
+        misses = np.linalg.norm(closest, axis=1) > 1
+        beyond.append(photo[misses][::step])
+    every, size, beyond = np.concatenate(seen), np.concatenate(size), np.concatenate(beyond)
     mean = np.bincount(every, np.concatenate(bright)) / np.maximum(np.bincount(every), 1)   # (K,)
-    spread = np.std([np.median(b - mean[own]) for b, own in zip(bright, seen) if len(own)])
-    color = np.median(beyond, 0) if len(beyond) > 100 else np.full(3, np.nan)   # people may hide it
-    is_flat = (np.abs(beyond - color) < 5.1).all(1).sum() > 0.6 * len(beyond)
-    inside = np.linalg.norm(points[every], axis=1) < 1
-    size = size[inside] if inside.any() else np.linalg.norm(c2w[:, :, 3], axis=1) / K[:, 0]
-    return scene | dict(near=np.float32(near), track_uv=np.concatenate(places, dtype=np.float32),
-                        exposure_spread=spread, bg_color=color / (255 if is_flat else np.nan),
-                        footprint=np.quantile(size, 0.25))
+    offsets = [np.median(b - mean[own]) for b, own in zip(bright, seen) if len(own)]
+    color = np.full(3, np.nan)
+    if len(beyond) > 100:   # fewer may all be people
+        median = np.median(beyond, 0)
+        agree = (np.abs(beyond - median) < 5.1).all(1)
+        if agree.sum() > 0.6 * len(beyond):
+            color = median / 255
+    inside = np.linalg.norm(scene["points"][every], axis=1) < 1
+    if inside.any():
+        size = size[inside]
+    else:
+        size = np.linalg.norm(c2w[:, :, 3], axis=1) / K[:, 0]
+    scene["near"] = np.float32(near)
+    scene["track_uv"] = np.concatenate(places, dtype=np.float32)
+    scene["footprint"] = np.quantile(size, 0.25)
+    scene["exposure_spread"] = np.std(offsets)
+    scene["bg_color"] = color
+    return scene
+
+
+# ---- folders with photos and COLMAP models -------------------------------------------------------
+PHOTO_TYPES = ".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"
+# By COLMAP's number of a camera model: how many numbers it has. A letter is one of those that are
+# read here: focal lengths, centre, distortion as in OpenCV.
+PARAMETERS = 3, 4, 4, 5, 8, 8, 12, 5, 4, 5, 12, 16, 4, 5, 3, 4, 6, 2
+FOCAL_LENGTHS = {0: 1, 1: 2, 2: 1, 3: 1, 4: 2, 6: 2}   # not of fisheye and other models
+
+
+@dataclass
+class Photo:
+    """A photo as a model has it. wh (w,h); K (4,), c2w (3,4) and bend, k1 k2 p1 p2 k3 .. k6 of
+    OpenCV, are None if fault, a sentence about the photo, says why it cannot be used."""
+    fault: str = ""
+    wh: tuple = ()
+    K: np.ndarray = None
+    bend: np.ndarray = None
+    c2w: np.ndarray = None
+    point_ids: tuple = ()
 
 
 def open_binary(path):
-    """Bounded reader of a little-endian file: take(format) -> values, take(number) -> bytes."""
-    need(path.is_file(), f"{path} is missing: copy the whole COLMAP model, in its binary form")
+    """Bounded reader of a little-endian file: read(format) -> values, read(number) -> bytes."""
+    check(path.is_file(), f"{path} is missing: copy the whole COLMAP model, in its binary form")
     file = io.BytesIO(path.read_bytes())
 
-    def take(what):
+    def read(what):
         size = what if isinstance(what, int) else struct.calcsize("<" + what)
         data = file.read(min(size, sys.maxsize))
-        need(len(data) == size, f"{path} ends too early: copy or export it again")
+        check(len(data) == size, f"{path} ends too early: copy or export it again")
         return data if size == what else struct.unpack("<" + what, data)
-    return take
+    return read
 
 
-MODELS = {0: "f", 1: "ff", 2: "fk", 3: "fkk", 4: "ffkkpp"}   # f, then cx cy, then distortion
+def read_cameras(sparse):
+    """{id: Photo without pose}"""
+    cameras = {}
+    read = open_binary(sparse / "cameras.bin")
+    undistort = f"run colmap image_undistorter with --input_path {sparse}"
+    for _ in range(*read("Q")):
+        key, model, w, h = read("IiQQ")
+        is_known = 0 <= model < len(PARAMETERS)
+        check(is_known, f"{sparse} has camera model {model}, which is unknown: {undistort}")
+        numbers = np.array(read(f"{PARAMETERS[model]}d"))
+        n = FOCAL_LENGTHS.get(model)
+        if n is None:
+            cameras[key] = Photo(f"has a fisheye or other camera of model {model}: {undistort}")
+            continue
+        is_sound = (np.abs(numbers) < FAR).all() and min(numbers[:n]) > 1 / FAR   # false for nan
+        if not is_sound or not (0 < w < 32767 and 0 < h < 32767):
+            fault = f"has camera {key} of {w} x {h} with {numbers.tolist()}, which cannot be"
+            cameras[key] = Photo(f"{fault}: export the model again")
+            continue
+        bend = np.zeros(8)
+        bend[:len(numbers) - n - 2] = numbers[n + 2:]
+        K = numbers[[0, n - 1, n, n + 1]]
+        cameras[key] = Photo(wh=(w, h), K=K, bend=bend)
+    return cameras
 
 
-def read_colmap(sparse):
-    """A COLMAP model, SfM units. -> points (K,5) as in finish, photos {name: ((w, h, K (4,), k1
-    k2 p1 p2 (4,)), c2w (3,4), points (M,) that it observes)}"""
-    take, cameras, photos, index, points = open_binary(sparse / "points3D.bin"), {}, {}, {}, []
-    for _ in range(*take("Q")):
-        key, x, y, z, *_, error, views = take("Q3d3BdQ")
-        take(8 * views)
+def read_photos(sparse):
+    """{name: Photo} of a COLMAP model, SfM units."""
+    cameras = read_cameras(sparse)
+    photos = {}
+    read = open_binary(sparse / "images.bin")
+    for _ in range(*read("Q")):
+        _, *pose, camera = read("I7dI")
+        name = b"".join(iter(lambda: read(1), b"\0")).decode(errors="replace")
+        (count,) = read("Q")
+        ids = np.frombuffer(read(24 * count), "<u8")[2::3]   # of u, v, point
+        is_inside = name and name[0] != "/" and "\\" not in name and ".." not in name.split("/")
+        check(is_inside, f"{sparse}: photo {name!r} is outside the image folder: rename it")
+        check(name not in photos, f"{sparse}: photo {name!r} occurs twice: export the model again")
+        photo = cameras.get(camera, Photo("has no camera in the model: export it again"))
+        is_sound = all(abs(value) < FAR for value in pose) and any(pose[:4])   # false for nan
+        if not is_sound:
+            photo = Photo("has no sound pose: run SfM again")
+        if not photo.fault:
+            w, *v = np.array(pose[:4]) / math.hypot(*pose[:4])   # old files are not normalised
+            cross = np.cross(v, np.eye(3))
+            R = np.eye(3) + 2 * w * cross + 2 * cross @ cross   # camera to world
+            c2w = np.column_stack([R, -R @ pose[4:]])
+            photo = Photo("", photo.wh, photo.K, photo.bend, c2w, ids.tolist())
+        photos[name] = photo
+    return photos
+
+
+def read_points(sparse):
+    """Points (K,5) of a COLMAP model, as in finish, and {id: row}."""
+    path = sparse / "points3D.bin"
+    triangulate = f"run colmap point_triangulator with --input_path {sparse}"
+    check(path.is_file(), f"{path} is missing: {triangulate}")
+    read = open_binary(path)
+    points = []
+    rows = {}
+    for _ in range(*read("Q")):
+        key, x, y, z, *_, error, views = read("Q3d3BdQ")
+        read(8 * views)
         if all(abs(value) < FAR for value in (x, y, z, error)):   # false for nan
-            index[key] = len(points)
+            rows[key] = len(points)
             points.append((x, y, z, error, views))
-    take = open_binary(sparse / "cameras.bin")
-    for _ in range(*take("Q")):
-        key, model, w, h = take("IiQQ")
-        need(model in MODELS, f"{sparse} has camera model {model}: run colmap image_undistorter")
-        n, p = MODELS[model].count("f"), np.array(take(f"{len(MODELS[model]) + 2}d"))
-        need(0 < w < 32767 and 0 < h < 32767 and (np.abs(p) < FAR).all() and min(p[:n]) > 1 / FAR,
-             f"{sparse}: camera {key} is {w} x {h} with {p.tolist()}, which cannot be: export it")
-        cameras[key] = w, h, p[[0, n - 1, n, n + 1]], np.append(p[n + 2:], np.zeros(4))[:4]
-    take = open_binary(sparse / "images.bin")
-    for _ in range(*take("Q")):
-        _, *pose, camera = take("I7dI")
-        name = b"".join(iter(lambda: take("c")[0], b"\0")).decode(errors="replace")
-        seen = np.frombuffer(take(24 * take("Q")[0]), "<u8")[2::3].tolist()   # of u, v, point
-        need(name and name[0] != "/" and "\\" not in name and ".." not in name.split("/"),
-             f"{sparse}: photo {name!r} is outside the image folder; rename it")
-        is_sound = all(abs(value) < FAR for value in pose) and any(pose[:4])
-        need(is_sound and camera in cameras and name not in photos,
-             f"{sparse}: photo {name!r} has no sound pose, no camera, or occurs twice")
-        w, *v = np.array(pose[:4]) / math.hypot(*pose[:4])   # old files are not normalised
-        cross = np.cross(v, np.eye(3))   # c2w = 1 - 2 w [v] + 2 [v] [v]
-        R = np.eye(3) + 2 * w * cross + 2 * cross @ cross
-        own = np.array([index[key] for key in seen if key in index], int)
-        photos[name] = cameras[camera], np.column_stack([R, -R @ pose[4:]]), own
-    return np.array(points, float).reshape(-1, 5), photos
+    points = np.array(points, float).reshape(-1, 5)
+    has_tracks = (points[:, 4] > 1).any()
+    check(has_tracks, f"{path} has {len(points)} points, none with a track: {triangulate}")
+    return points, rows
+
+
+def share_in_photo(points, photos, tracks):
+    """Share of the sightings that the poses put into the photo that saw them, spread over it."""
+    inside = []
+    for photo, own in zip(photos, tracks):
+        place = project(photo.K, photo.c2w, points[own, :3])[0] / photo.wh
+        ok = ((place >= 0) & (place <= 1)).all(1)
+        if ok.sum() > 20 and np.ptp(place[ok], axis=0).max() < .02:
+            ok[:] = False   # all at one place: points in smaller units than the poses
+        inside.append(ok)
+    return np.concatenate(inside).mean()
+
+
+def photo_files(folder):
+    """{name: path} of the photos below a folder; dense/ holds copies of those outside it."""
+    files = {}
+    for path in sorted(folder.rglob("*")):
+        name = path.relative_to(folder)
+        is_hidden = path.name.startswith(".") or name.parts[0] == "dense"
+        if path.suffix.lower() in PHOTO_TYPES and not is_hidden:
+            files[name.as_posix()] = path
+    return files
+
+
+def stem(name):
+    return Path(name.replace("\\", "/")).stem.lower()
+
+
+def match(names, known):
+    """{name: the same in `known`, or the only one there by another folder or extension}"""
+    found = {name: name for name in names if name in known}
+    missing = collections.Counter(stem(name) for name in names if name not in found)
+    free = collections.defaultdict(list)
+    for name in known:
+        if name not in found:
+            free[stem(name)].append(name)
+    for name in names:
+        others = free[stem(name)]
+        if name not in found and len(others) == missing[stem(name)] == 1:
+            found[name] = others[0]
+    return found
+
+
+def warn_renamed(found, what):
+    renamed = [f"{name} as {other}" for name, other in found.items() if name != other]
+    if renamed:
+        warn(f"{len(renamed)} {what} by another folder or extension: {', '.join(renamed[:3])} ...")
+
+
+def model_folders(folder, ending="bin"):
+    """Folders with COLMAP models, at most four levels down; links are followed."""
+    places = {path.parent for depth in range(5) for path in folder.glob("*/" * depth + f"images.{ending}")}
+    return sorted(places, key=lambda place: (len(place.parts), place))
+
+
+@dataclass
+class Model:
+    """A COLMAP model: its photos {name: Photo}, and the files {name: path} of those on disk."""
+    sparse: Path
+    photos: dict
+    images: Path = None
+    on_disk: int = 0
+    files: dict = None
+
+
+def open_model(folder, sparse):
+    """The model, with that folder of photos around it in which most of its photos are."""
+    model = Model(sparse, read_photos(sparse), files={})
+    around = [sparse, *sparse.parents]
+    around = around[:around.index(folder) + 1]
+    for place, name in itertools.product(around, ("images", "input", "")):
+        files = photo_files(place / name)
+        found = match(model.photos, files)
+        if len(found) > len(model.files):
+            model.images = place / name
+            model.on_disk = len(files)
+            model.files = {name: files[other] for name, other in found.items()}
+            renamed = found
+    if model.files:
+        warn_renamed(renamed, f"photos of {sparse} are on disk")
+    return model
+
+
+def find_model(folder, command):
+    """The model of the folder with most usable photos; says what that leaves out."""
+    places = model_folders(folder)
+    for text in model_folders(folder, "txt"):
+        check(places, f"{text} is a model as text: run colmap model_converter --input_path {text} "
+              f"--output_path {text} --output_type BIN")
+    check(places, f"{folder} has no COLMAP model; run: python data_prep.py {command}")
+    models = [open_model(folder, sparse) for sparse in places]
+
+    def rank(model):
+        photos = [model.photos[name] for name in model.files]
+        usable = [photo for photo in photos if not photo.fault]
+        return len(usable), sum(not photo.bend.any() for photo in usable)
+    best = max(models, key=rank)
+    check(best.files, f"no photo of {best.sparse} is on disk: put them into {folder / 'images'}; "
+          f"or run: python data_prep.py {command}")
+    on_disk = max(model.on_disk for model in models)
+    others = [f"{model.sparse} {len(model.photos)}" for model in models
+              if model.photos.keys() != best.photos.keys()]
+    line = f"{best.images}: {on_disk} photos on disk, {len(best.files)} posed by {best.sparse}"
+    if others:
+        line += f"; lost are other models: {', '.join(others)}"
+    print(line)
+    return best
+
+
+def read_table(path):
+    """Rows of a .tsv or .csv file as dictionaries by the names of its columns."""
+    data = path.read_bytes()
+    is_wide = data[:2] in (b"\xff\xfe", b"\xfe\xff")
+    lines = data.decode("utf-16" if is_wide else "utf-8-sig", "replace").splitlines()
+    lines = [line for line in lines if line.strip()] or [""]
+    mark = max("\t;,", key=lines[0].count)
+    rows = [[word.strip(' "') for word in line.split(mark)] for line in lines]
+    return [dict(zip(rows[0], row)) for row in rows[1:]], rows[0]
 
 
 def read_split(path):
-    """NeRF-W table, by column name: {photo: "train" or "test"}; rows with empty id are dropped."""
-    need(path.is_file(), f"the split file {path} is not there")
-    lines, split = path.read_bytes().decode("utf-8-sig", "replace").splitlines(), {}
-    head, *rows = [line.split("\t") for line in lines if line] or [[]]
-    need({"filename", "split"} <= set(head), f"{path} needs a header with filename, tab, and split")
-    for row in (dict(zip(head, row)) for row in rows):
+    """{name: "train" or "test"} of a table with NeRF-W's columns, without the rows with an empty
+    id; or of train_list.txt and test_list.txt, one of which is `path`."""
+    check(path.is_file(), f"the split file {path} is not there")
+    rows, head = read_table(path)
+    if path.suffix == ".txt" and "split" not in head:
+        rows = []
+        for part, other in ("train", "test"), ("test", "train"):
+            table = path.with_name(path.name.replace(other, part))
+            check(table.is_file(), f"{table} is missing: each split needs both lists")
+            names, first = read_table(table)
+            rows += [dict(filename=name, split=part) for name in first]
+    else:
+        has_columns = {"filename", "split"} <= set(head)
+        check(has_columns, f"{path} needs a header with filename and split")
+    split = {}
+    for row in rows:
         name, part = row.get("filename"), row.get("split")
-        is_sound = name and part in ("train", "test")
-        need(row.get("id") == "" or is_sound and split.setdefault(name, part) == part,
-             f"{path}: {name!r} is {part!r}; each photo is train or test, and not both")
+        if row.get("id") == "":
+            continue
+        is_sound = name and part in ("train", "test") and split.setdefault(name, part) == part
+        check(is_sound, f"{path}: {name!r} is {part!r}; each photo is train or test, and not both")
     return split
 
 
-def read_photo(path, camera, downscale):
+def find_split(folder, images):
+    """The split files of a folder that belong together; of several kinds the first one."""
+    for place, kind in itertools.product((folder, images.parent), ("*.tsv", "*.csv", "train*.txt")):
+        tables = [path for path in sorted(place.glob(kind)) if path.name[0] != "."]
+        if kind == "*.csv":   # people keep other tables too
+            tables = [path for path in tables if "filename" in read_table(path)[1]]
+        if tables:
+            names = ", ".join(table.name for table in tables)
+            check(len(tables) == 1, f"{place} has several split files ({names}): choose by --split")
+            return tables[0]
+    return None
+
+
+def fingerprint(folder, images, split):
+    """Of names, sizes and times of all files that a scene is read from."""
+    paths = list(photo_files(images).values())
+    for place in model_folders(folder):
+        paths += place.glob("*.bin")
+    for place in (folder, images.parent):
+        paths += [path for kind in ("*.tsv", "*.csv", "*.txt") for path in place.glob(kind)]
+    if split:
+        paths.append(Path(split))
+    lines = []
+    for path in sorted(paths):
+        if path.exists():
+            lines.append(f"{path} {path.stat().st_size} {path.stat().st_mtime_ns}")
+    return zlib.crc32(os.fsencode("\n".join(lines)))
+
+
+def decode(path):
+    """The photo, BGR as OpenCV has it, unturned as COLMAP has it. -> uint8 (h,w,3)"""
+    data = path.read_bytes()
+    # OpenCV says nothing where a file is cut off. A JPEG's last scan ends with an end mark.
+    is_jpeg = data[:2] == b"\xff\xd8"
+    is_png = data[1:4] == b"PNG"
+    is_whole = data.rfind(b"\xff\xd9") > data.rfind(b"\xff\xda") if is_jpeg else True
+    check(is_whole and (b"IEND" in data or not is_png), "is cut off: copy it again")
+    image = None
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    except cv2.error as e:   # empty, or more than a gigapixel
+        raise UserError(f"cannot be read ({e.err}): replace it") from e
+    check(image is not None, "is no photo, or damaged: replace it")
+    return image
+
+
+def read_photo(path, photo, downscale):
     """Undistorted, then reduced. -> rgb uint8 (h,w,3), K (4,)"""
-    image, (w, h, K, bend) = None, camera
-    need(1 <= downscale <= min(w, h) / 2, f"--downscale {downscale} leaves nothing of {path}")
-    with contextlib.suppress(Exception):   # cut off, no photo, more than a gigapixel
-        skimage.io.imread(path)   # as OpenCV says nothing where a JPEG is cut off
-        image = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)   # COLMAP's
-    need(np.shape(image)[:2] == (h, w), f"{path} is no photo of {w} x {h}: replace or delete it")
-    if bend.any():   # OpenCV's first pixel is at 0
+    check(not photo.fault, photo.fault)
+    (w, h), K = photo.wh, photo.K
+    check(downscale <= min(w, h) / 2, f"is {w} x {h}: --downscale {downscale} leaves nothing of it")
+    image = decode(path)
+    size = image.shape[1::-1]
+    check(size == (w, h), f"has {size[0]} x {size[1]} pixels, its camera {w} x {h}: "
+          "put back the photos that SfM saw")
+    if photo.bend.any():   # OpenCV's first pixel is at 0
         M = np.array([[K[0], 0, K[2] - 0.5], [0, K[1], K[3] - 0.5], [0, 0, 1]])
-        P = cv2.getOptimalNewCameraMatrix(M, bend, (w, h), 0)[0]   # shows nothing but photo
-        P = P if P[0, 0] > M[0, 0] or P[1, 1] > M[1, 1] else M
-        image = cv2.undistort(image, M, bend, None, P)
+        P = cv2.getOptimalNewCameraMatrix(M, photo.bend, (w, h), 0)[0]   # shows nothing but photo
+        if P[0, 0] <= M[0, 0] and P[1, 1] <= M[1, 1]:
+            P = M
+        image = cv2.undistort(image, M, photo.bend, None, P)
         K = P[[0, 1, 0, 1], [0, 1, 2, 2]] + (0, 0, 0.5, 0.5)
     small = w // downscale, h // downscale
-    image = cv2.cvtColor(cv2.resize(image, small, interpolation=cv2.INTER_AREA), cv2.COLOR_BGR2RGB)
-    return image, K * np.tile(np.array(small) / (w, h), 2)
+    image = cv2.resize(image, small, interpolation=cv2.INTER_AREA)
+    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB), K * np.tile(np.array(small) / (w, h), 2)
+
+
+def choose_parts(folder, model, split):
+    """{name: "train" or "test"} of the photos that are to be used, and {name: fault} of others."""
+    table = Path(split) if split else find_split(folder, model.images)
+    names = sorted(model.files)
+    if table is None:
+        print(f"{folder} has no split file: every eighth photo is held out")
+        return {name: "test" if i % 8 == 7 else "train" for i, name in enumerate(names)}, {}
+    print(f"split by {table}")
+    split = read_split(table)
+    found = match(split, model.files)
+    warn_renamed(found, f"photos of {table} are known")
+    parts = {other: split[name] for name, other in found.items()}
+    lost = split.keys() - found.keys()
+    faults = {name: "has no pose or no file" for name in lost if split[name] == "test"}
+    for out, why in (lost, "of the split file have no pose or no file"), (
+            model.files.keys() - parts.keys(), "are not in the split file"):
+        if out:
+            warn(f"{len(out)} photos {why}: {', '.join(sorted(out)[:3])} ...")
+    return parts, faults
 
 
 def prepare(name, downscale=2, split=None):
-    """Scene of one of SCENES, or of a folder with [dense/[0/]]{images,sparse[/0]}; see FORMAT."""
-    names = (f"data/{name}", f"data/{SCENES[name][0]}") if name in SCENES else [name]
-    places = [(Path(n), Path(n, dense, "images"), Path(n, dense, "sparse", number)) for n in names
-              for dense in ("dense", "dense/0", "") for number in ("0", "")]
-    found = [place for place in places if place[1].is_dir() and place[2].is_dir()]
-    need(found, f"{names[0]} has no folders images and sparse; run: python data_prep.py {name} "
-         f"--{'download' if name in SCENES else 'sfm'}")
-    folder, images, sparse = found[0]
-    tables = [Path(split)] if split else sorted(folder.glob("[!.]*.tsv"))
-    need(len(tables) < 2, f"{folder} has {len(tables)} split files: name one, data_prep.py --split")
-    points, photos = read_colmap(sparse)
-    here = sorted(n for n in photos if (images / n).is_file())
-    parts = read_split(tables[0]) if tables else {
-        n: "test" if i % 8 == 7 else "train" for i, n in enumerate(here)}
-    odd = {n for n in here for w, h, K, _ in [photos[n][0]] if parts.get(n) == "train"
-           and not 10 <= 2 * np.degrees(np.arctan(max(w / K[0], h / K[1]) / 2)) <= 120}
-    for out, why in ((photos.keys() - here, "of the model are not on disk"),
-                     (parts.keys() - here, "of the split file have no pose or no file"),
-                     (here - parts.keys(), "are not in the split file"),
-                     (odd, "are narrower than 10 or wider than 120 degrees")):
-        if out:
-            print(f"{len(out)} photos {why}: {', '.join(sorted(out)[:3])} ...", file=sys.stderr)
-    names = [n for n in here if n in parts and n not in odd]
-    is_test = np.array([parts[n] == "test" for n in names], bool)
-    need((~is_test).sum() >= 2, f"{folder} has not 2 usable training photos: check its split file")
-    rgb, K = zip(*[read_photo(images / n, photos[n][0], downscale)
-                   for n in tell(names, "preparing photos")])
-    _, c2w, tracks = zip(*[photos[n] for n in names])
+    """Scene of one of SCENES, or of a folder with photos and a COLMAP model; see FORMAT."""
+    check(downscale >= 1, f"--downscale {downscale} is not 1 or more")
+    folder = Path(name)
+    command = f"{name} --sfm"
+    if name in SCENES:
+        homes = [Path("data", home) for home in (name, SCENES[name][0])]
+        folder = homes[0] if homes[0].is_dir() else homes[1]
+        command = f"{name} --download"
+    model = find_model(folder, command)
+    files = fingerprint(folder, model.images, split)
+    parts, lost_tests = choose_parts(folder, model, split)
+    points, rows = read_points(model.sparse)
+    choose_points(points)   # fails before photos are read
+    tracks = {}
+    for name, photo in model.photos.items():
+        tracks[name] = np.array([rows[key] for key in photo.point_ids if key in rows], int)
+    sound = [name for name, photo in model.photos.items() if not photo.fault]
+    share = share_in_photo(points, [model.photos[n] for n in sound], [tracks[n] for n in sound])
+    check(share >= .5, f"{model.sparse}: only {share:.0%} of the sightings fall into the photo that "
+          "saw them: give poses as COLMAP does, world to camera, x right, y down, z forward, in "
+          "the units of the points")
+    if share < .9:
+        warn(f"{model.sparse}: only {share:.0%} of the sightings fall into the photo that saw them")
+    images, K, faults, used = [], [], {}, []
+    for name in progress(sorted(parts), "preparing photos"):
+        photo = model.photos[name]
+        try:
+            image, k = read_photo(model.files[name], photo, downscale)
+            angle = 2 * np.degrees(np.arctan(max(photo.wh / photo.K[:2]) / 2))
+            is_usual = parts[name] == "test" or 10 <= angle <= 120
+            check(is_usual, f"is narrower than 10 or wider than 120 degrees: {angle:.0f}")
+        except UserError as e:
+            faults[name] = str(e)
+            continue
+        used.append(name)
+        images.append(image)
+        K.append(k)
+    for name, fault in faults.items():
+        warn(f"left out: {name} {fault}")
+        if parts[name] == "test":
+            lost_tests[name] = fault
+    listed = "; ".join(f"{name} {fault}" for name, fault in lost_tests.items())
+    check(not lost_tests, f"held-out photos cannot be used: {listed}; mend them, or choose others "
+          "by a split file")
+    is_test = np.array([parts[name] == "test" for name in used], bool)
+    first = "".join(f"; {name} {fault}" for name, fault in list(faults.items())[:1])
+    check((~is_test).sum() >= 2, f"{folder} has {(~is_test).sum()} usable training photos of at "
+          f"least 2: check its split file and photos{first}")
     info = dict(scene=folder.resolve().name, kind="colmap", downscale=downscale,
-                folder=str(folder), split=split and str(Path(split).resolve()))
-    return finish(rgb, K, c2w, is_test, names, points, tracks, info)
+                folder=str(folder), split=split and str(Path(split).resolve()),
+                images=str(model.images), files=files)
+    c2w = [model.photos[name].c2w for name in used]
+    own = [tracks[name] for name in used]
+    scene = finish(images, K, c2w, is_test, used, points, own, info)
+    inside = (np.linalg.norm(scene["points"], axis=1) < 1).mean()
+    print(f"the sphere has a radius of {scene['scale']:.3g} units of the reconstruction; "
+          f"{inside:.0%} of the points are inside")
+    return scene
 
 
 def scene_path(name_or_folder):
     """data/<scene>.npz; of two folders with one name each has its own."""
     folder = Path(name_or_folder).resolve()
-    mark = f"-{zlib.crc32(os.fsencode(folder)):08x}"
-    return Path("data", folder.name + ("" if name_or_folder in ("toy", *SCENES) else mark) + ".npz")
+    mark = ""
+    if name_or_folder not in ("toy", *SCENES):
+        mark = f"-{zlib.crc32(os.fsencode(folder)):08x}"
+    return Path("data", f"{folder.name}{mark}.npz")
+
+
+def is_fresh(info):
+    """Whether the sources are what they were; a scene file also does without them."""
+    if info["kind"] == "toy" or not Path(info["folder"]).is_dir():
+        return True
+    if "files" not in info:   # by an older version
+        return False
+    files = fingerprint(Path(info["folder"]), Path(info["images"]), info["split"])
+    return files == info["files"]
 
 
 def open_scene(name_or_folder, downscale=2):
-    """Scene from its file: made on first use, and anew if photos, poses or split are newer."""
-    path, is_toy, split = scene_path(name_or_folder), name_or_folder == "toy", None
+    """Scene from its file: made on first use, and anew if its sources differ in any way."""
+    path = scene_path(name_or_folder)
+    is_toy = name_or_folder == "toy"
+    split = None
     if path.exists():
-        scene, made = read_scene(path), path.stat().st_mtime
+        scene = read_scene(path)
         info = json.loads(str(scene["info"]))
-        split, folder = info["split"], Path(info["folder"] or "")   # split: named once, by --split
-        inside = map(folder.glob, ("[!.]*.tsv", "**/images*", "**/images/**/*"))
-        files = itertools.chain([Path(split or folder)], *inside)
-        newer = (p for p in files if p.exists() and p.stat().st_mtime > made)
-        if is_toy or info["downscale"] == downscale and not any(newer):
+        split = info["split"]   # named once, by --split
+        if is_toy or (info["downscale"] == downscale and is_fresh(info)):
             return scene
     print(f"making {path}")
     scene = make_toy() if is_toy else prepare(name_or_folder, downscale, split)
@@ -549,6 +1100,7 @@ def open_scene(name_or_folder, downscale=2):
     return scene
 
 
+# ---- download, SfM, command line -----------------------------------------------------------------
 def fetch(url, path):
     """Streams url into path; what came of a broken transfer waits in path.part to be continued."""
     part = path.with_name(path.name + ".part")
@@ -558,12 +1110,13 @@ def fetch(url, path):
             have = max(file.tell() - 1, 0)
             request = urllib.request.Request(url, headers={"Range": f"bytes={have}-"})
             with urllib.request.urlopen(request, timeout=60) as answer:
-                have *= answer.status == 206   # a server without ranges starts over
+                if answer.status != 206:
+                    have = 0   # a server without ranges starts over
                 total = have + int(answer.headers.get("Content-Length", -1))
                 file.truncate(have)
-                for _ in tell(range(have, total, 1 << 20), f"MiB of {path.name}"):
+                for _ in progress(range(have, total, 1 << 20), f"MiB of {path.name}"):
                     have += file.write(answer.read(1 << 20))
-        need(have == total, f"the download of {url} broke off; the same command continues it")
+        check(have == total, f"the download of {url} broke off; the same command continues it")
         os.replace(part, path)
     except (OSError, http.client.HTTPException) as e:
         if getattr(e, "code", 0) == 416:   # longer than the file itself
@@ -571,25 +1124,33 @@ def fetch(url, path):
         raise UserError(f"the download of {url} broke ({e}); the same command continues it") from e
 
 
+def unpack(archive, wanted, folder):
+    """Files of a .tar.gz whose names start so; the whole archive is checked."""
+    with gzip.open(archive) as raw:
+        with tarfile.open(fileobj=raw, mode="r|") as tar:
+            for member in tar:   # files only: a link could lead outside
+                if member.isfile() and member.name.startswith(wanted):
+                    tar.extract(member, folder, filter="data")
+        while raw.read(1 << 20):   # to the checksum at the very end
+            pass
+
+
 def download(name, archive_url=ARCHIVE_URL, split_url=SPLIT_URL):
     """Photos and reconstruction of one of SCENES, with its split file -> data/<name>/"""
-    need(name in SCENES, f"--download knows {', '.join(SCENES)}, not {name}")
-    (scene, table), root = SCENES[name], Path("data")
-    archive, home = root / f"{scene}.tar.gz", root / name
-    need(not home.exists(), f"{home} is there already: move it, or leave --download out")
-    for url, path in (split_url + table, root / table), (archive_url + archive.name, archive):
-        if not path.exists():
-            fetch(url, path)
-    wanted = f"{scene}/dense/images/", f"{scene}/dense/sparse/"
+    check(name in SCENES, f"--download knows {', '.join(SCENES)}, not {name}")
+    scene, table_name = SCENES[name]
+    home = Path("data", name)
+    table = Path("data", table_name)
+    archive = Path("data", f"{scene}.tar.gz")
+    check(not home.exists(), f"{home} is there already: move it, or leave --download out")
+    if not table.exists():
+        fetch(split_url + table.name, table)
+    if not archive.exists():
+        fetch(archive_url + archive.name, archive)
     try:
-        with tempfile.TemporaryDirectory(dir=root) as temporary, gzip.open(archive) as raw:
-            with tarfile.open(fileobj=raw, mode="r|") as tar:
-                for member in tar:   # files only: a link could lead outside
-                    if member.isfile() and member.name.startswith(wanted):
-                        tar.extract(member, temporary, filter="data")
-            while raw.read(1 << 20):   # to the checksum at the very end
-                pass
-            shutil.copy(root / table, Path(temporary, scene, table))
+        with tempfile.TemporaryDirectory(dir="data") as temporary:
+            unpack(archive, (f"{scene}/dense/images/", f"{scene}/dense/sparse/"), temporary)
+            shutil.copy(table, Path(temporary, scene, table.name))
             os.replace(Path(temporary, scene), home)
     except (tarfile.TarError, EOFError, zlib.error, OSError, TypeError) as e:
         raise UserError(f"cannot unpack {archive} ({e}): free space, or delete it and retry") from e
@@ -598,40 +1159,56 @@ def download(name, archive_url=ARCHIVE_URL, split_url=SPLIT_URL):
 def run_sfm(folder):
     """Poses for the raw photos in `folder`, by pycolmap -> folder/dense/{images,sparse}"""
     import pycolmap   # an extra: main says when it is not there
-    database, models, dense = (folder / name for name in ("database.db", "models", "dense"))
-    need(folder.is_dir() and not dense.exists(), f"{folder} is missing, or has dense/: delete that")
+    database = folder / "database.db"
+    models = folder / "models"
+    dense = folder / "dense"
+    check(folder.is_dir() and not dense.exists(), f"{folder} is missing, or has dense/: delete that")
     models.mkdir(exist_ok=True)
+    options = pycolmap.IncrementalPipelineOptions()
+    options.mapper.abs_pose_min_num_inliers = 15   # tourists' photos share few features
+    options.mapper.init_min_num_inliers = 50
     pycolmap.extract_features(database, folder)
     pycolmap.match_exhaustive(database)
-    found = pycolmap.incremental_mapping(database, folder, models)
-    need(found, f"the photos in {folder} do not match each other; take more, with more overlap")
+    found = pycolmap.incremental_mapping(database, folder, models, options)
+    check(found, f"the photos in {folder} do not match each other; take more, with more overlap")
     best = max(found, key=lambda i: found[i].num_reg_images())
     pycolmap.undistort_images(dense, models / str(best), folder)
 
 
 def main(argv=None):
-    p = argparse.ArgumentParser(allow_abbrev=False, argument_default=argparse.SUPPRESS, description=
-                                __doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    p.add_argument("scene", help=f"toy, {', '.join(SCENES)}, or a folder")
-    p.add_argument("--download", action="store_true", help="fetch archive and split file first")
-    p.add_argument("--sfm", action="store_true", help="the folder has raw photos: pose them first")
-    p.add_argument("--downscale", type=int, help="photos get this many times smaller; default 2")
-    p.add_argument("--split", help="table of training and test photos; default: <folder>/*.tsv")
-    for key, value in zip(inspect.signature(make_toy).parameters, make_toy.__defaults__):
-        how = {"action": argparse.BooleanOptionalAction} if value is True else {"type": type(value)}
-        p.add_argument(f"--{key}", help=f"toy, default {value}", **how)
-    given = vars(p.parse_args(argv))
-    name, fetch_first, sfm_first = (given.pop(key, None) for key in ("scene", "download", "sfm"))
-    make, path = make_toy if name == "toy" else prepare, scene_path(name)
-    wrong = given.keys() - inspect.signature(make).parameters
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False, argument_default=argparse.SUPPRESS)
+    add = parser.add_argument
+    add("scene", help=f"toy, {', '.join(SCENES)}, or a folder")
+    add("--download", action="store_true", help="fetch archive and split file first")
+    add("--sfm", action="store_true", help="the folder has raw photos: pose them first")
+    add("--downscale", type=int, help="photos get this many times smaller; default 2")
+    add("--split", help="table of training and test photos; default: <folder>/*.tsv or *.csv, or "
+        "train_list.txt and test_list.txt, or every eighth photo")
+    knobs = inspect.signature(make_toy).parameters
+    for key, knob in knobs.items():
+        how = {"type": type(knob.default)}
+        if isinstance(knob.default, bool):
+            how = {"action": argparse.BooleanOptionalAction}
+        add(f"--{key}", help=f"toy, default {knob.default}", **how)
+    given = vars(parser.parse_args(argv))
+    name = given.pop("scene")
+    is_download = given.pop("download", False)
+    is_sfm = given.pop("sfm", False)
+    path = scene_path(name)
+    allowed = knobs if name == "toy" else ("downscale", "split")
+    wrong = given.keys() - allowed
     try:
-        need(not wrong, f"--{' --'.join(wrong)}: not for {name}")
-        fetch_first and download(name)
-        sfm_first and run_sfm(Path(name))
-        scene = make(**given) if name == "toy" else make(name, **given)
+        check(not wrong, f"--{' --'.join(wrong)}: not for {name}")
+        if is_download:
+            download(name)
+        if is_sfm:
+            run_sfm(Path(name))
+        scene = make_toy(**given) if name == "toy" else prepare(name, **given)
         write_scene(path, scene)
     except (UserError, OSError, MemoryError, ImportError, KeyboardInterrupt) as e:
-        print(f"error: {e}" if str(e) else "error: stopped; start again", file=sys.stderr)
+        warn(f"error: {e}" if str(e) else "error: stopped; start again")
         sys.exit(2)
     print(f"{path}: {len(scene['wh'])} photos, {scene['is_test'].sum()} of them for testing")
 
