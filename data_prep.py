@@ -27,11 +27,13 @@ import time
 import urllib.request
 import zipfile
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
 import numpy as np
+from numpy import array, clip, concatenate, hypot, inf, maximum, median, minimum, quantile, where
+from numpy.linalg import norm
 
 # name: (archive, split file)
 SCENES = {
@@ -130,22 +132,20 @@ def refuse_bomb(path):
 
 def check_scene(scene):
     """UserError unless the arrays fit FORMAT and each other."""
-    start = scene["start"]
-    wh = scene["wh"]
-    observations = scene["track_photo"], scene["track_point"]
-    sizes = dict(I=len(wh), J=len(wh) + 1, K=len(scene["points"]))
-    sizes.update(T=len(observations[0]), N=start[-1])
+    start, wh = scene["start"], scene["wh"]
+    photo, point = scene["track_photo"], scene["track_point"]
+    sizes = dict(I=len(wh), J=len(start), K=len(scene["points"]), T=len(photo), N=start[-1])
     for key, text in FORMAT.items():
-        array = scene[key]
+        value = scene[key]
         dtype, _, letters = text.partition(" ")
         shape = tuple(sizes.get(letter) or int(letter) for letter in letters)
-        check(array.shape == shape and str(array.dtype).startswith(dtype), key)
-        if dtype.startswith("f") and key != "bg_color":
-            check(np.isfinite(array).all(), key)
-    check((wh > 0).all() and start[0] == 0, "start")
-    check((np.diff(start) == wh.prod(1)).all(), "start")
-    check(np.min(observations) >= 0, "tracks")
-    check((np.max(observations, 1) < (sizes["I"], sizes["K"])).all(), "tracks")
+        check(value.shape == shape and str(value.dtype).startswith(dtype), key)
+        if dtype[0] == "f" and key != "bg_color":
+            check(np.isfinite(value).all(), key)
+    check(start[0] == 0 and (wh > 0).all(), "start")
+    check(np.array_equal(np.diff(start), wh.prod(1)), "start")
+    check(0 <= photo.min() and photo.max() < len(wh), "track_photo")
+    check(0 <= point.min() and point.max() < sizes["K"], "track_point")
     check(min(scene["footprint"], scene["scale"]) > 0, "scale")
     check(not scene["is_test"].all(), "is_test")
     info = json.loads(str(scene["info"]))
@@ -166,16 +166,16 @@ def read_scene(path):
 
 # ---- the toy: z up, front towards -y, in its own units; world = TOY_SCALE * x + TOY_ORIGIN -------
 TOY_SCALE = 3.7
-TOY_ORIGIN = np.array([12.0, -7.0, 5.0])
-SUN = np.array([-.50, -.62, .60]) / np.linalg.norm([-.50, -.62, .60])   # left, behind the tourists
+TOY_ORIGIN = array([12.0, -7.0, 5.0])
+SUN = array([-.50, -.62, .60]) / norm([-.50, -.62, .60])   # left, behind the tourists
 STONE, PALE, SAND, BRICK, ROOF, SLATE, COPPER, GOLD, HOUSE, LEAF, PAVING, MEADOW = range(12)
-WORDS = dict(box=1, column=2, ball=3, inf=np.inf, stone=STONE, pale=PALE, sand=SAND, brick=BRICK)
+WORDS = dict(box=1, column=2, ball=3, inf=inf, stone=STONE, pale=PALE, sand=SAND, brick=BRICK)
 WORDS.update(roof=ROOF, slate=SLATE, copper=COPPER, gold=GOLD)
 
 
 def table(text):
     lines = text.strip().splitlines()
-    return np.array([[float(WORDS.get(word, word)) for word in line.split()] for line in lines])
+    return array([[float(WORDS.get(word, word)) for word in line.split()] for line in lines])
 
 
 # Percent: colour, width and height of a cell, contrast of cells, has windows; a row a surface.
@@ -243,8 +243,8 @@ def town():
         tree = .8 * w
         parts.append((1, x, y, h / 2, h / 2, w, w, w, HOUSE))
         parts.append((1, x, y, h + .25, .25, w, 0, w, SLATE))
-        parts.append((3, .8 * x + 1, .7 * y, .2 + tree, tree, tree, tree, np.inf, LEAF))
-    return np.array(parts)
+        parts.append((3, .8 * x + 1, .7 * y, .2 + tree, tree, tree, tree, inf, LEAF))
+    return array(parts)
 
 
 def toy_parts(landmark, background):
@@ -259,12 +259,12 @@ def toy_parts(landmark, background):
             foot = np.append(group[:, 1:3].mean(0), group[0, 3] - group[0, 4])
             group[:, 1:4] = foot + (group[:, 1:4] - foot) * size + shift
             is_box = group[:, :1] == 1   # others stay round
-            group[:, 4:8] *= np.where(is_box, size[[2, 0, 0, 1]], size[2])
+            group[:, 4:8] *= where(is_box, size[[2, 0, 0, 1]], size[2])
         parts[:, 1] *= rng.choice((-1, 1))
         looks = [*rng.permutation(2), *SAND + rng.permutation(2), *ROOF + rng.permutation(3), GOLD]
         parts[:, 8] = np.take(looks, parts[:, 8].astype(int))
     if background:
-        parts = np.concatenate([parts, town()])
+        parts = concatenate([parts, town()])
     return parts
 
 
@@ -273,20 +273,20 @@ def part_sdf(part, x):
     p = x - part[..., 1:4]
     shape, half, bottom, top, depth = part.T[[0, 4, 5, 6, 7]]
     z = p[:, 2]
-    u = np.where(shape == 1, np.abs(p[:, 0]), np.hypot(p[:, 0], p[:, 1]))
+    u = where(shape == 1, abs(p[:, 0]), hypot(p[:, 0], p[:, 1]))
     # In the plane of u and z: the slanted side from bottom to top, and the caps.
     grow = top - bottom
     tall = 2 * half
     k = ((u - bottom) * grow + (z + half) * tall) / (grow ** 2 + tall ** 2)
-    k = np.clip(k, 0, 1)
-    side = np.hypot(u - bottom - k * grow, z + half - k * tall)
-    width = np.where(z < 0, bottom, top)
-    cap = np.hypot(np.maximum(u - width, 0), np.abs(z) - half)
-    inside = (np.abs(z) < half) & (u < bottom + grow * (z + half) / tall)
-    d = np.where(inside, -1, 1) * np.minimum(side, cap)
-    e = np.abs(p[:, 1]) - depth   # -inf for a column
-    d = np.hypot(np.maximum(d, 0), np.maximum(e, 0)) + np.minimum(np.maximum(d, e), 0)
-    return np.where(shape == 3, np.hypot(u, z) - bottom, d)
+    k = clip(k, 0, 1)
+    side = hypot(u - bottom - k * grow, z + half - k * tall)
+    width = where(z < 0, bottom, top)
+    cap = hypot(maximum(u - width, 0), abs(z) - half)
+    inside = (abs(z) < half) & (u < bottom + grow * (z + half) / tall)
+    d = where(inside, -1, 1) * minimum(side, cap)
+    e = abs(p[:, 1]) - depth   # -inf for a column
+    d = hypot(maximum(d, 0), maximum(e, 0)) + minimum(maximum(d, e), 0)
+    return where(shape == 3, hypot(u, z) - bottom, d)
 
 
 def toy_sdf(x_world, background=True, landmark=0):
@@ -313,28 +313,28 @@ def enter_part(part, o, d):
     c = (o[:, :n] ** 2).sum(1) - w * w
     root = np.sqrt(b * b - a * c)   # nan for a miss
     is_cone = a < 0   # such a ray is inside on one end, for ever
-    enter = np.where(is_cone & (rise < 0), -np.inf, (-b - root) / a)
-    leave = np.where(is_cone & (rise > 0), np.inf, (-b + root) / a)
+    enter = where(is_cone & (rise < 0), -inf, (-b - root) / a)
+    leave = where(is_cone & (rise > 0), inf, (-b + root) / a)
     for axis in range(n, 3):
         middle = -o[:, axis] / d[:, axis]
-        reach = np.abs((depth, half)[axis - 1] / d[:, axis])
-        enter = np.maximum(enter, middle - reach)
-        leave = np.minimum(leave, middle + reach)
-    return np.where((enter < leave) & (enter > 0), enter, np.inf)
+        reach = abs((depth, half)[axis - 1] / d[:, axis])
+        enter = maximum(enter, middle - reach)
+        leave = minimum(leave, middle + reach)
+    return where((enter < leave) & (enter > 0), enter, inf)
 
 
 @np.errstate(divide="ignore", invalid="ignore")
 def trace(o, d, parts, ground):
     """First hits of rays: distance (R,), inf is sky, and part (R,), -1 is the ground."""
-    t = np.where(ground & (d[:, 2] < -1e-3), -o[:, 2] / d[:, 2], np.inf)   # (R,)
+    t = where(ground & (d[:, 2] < -1e-3), -o[:, 2] / d[:, 2], inf)   # (R,)
     which = np.full(len(d), -1)
     centre = parts[:, 1:4]
     along = centre @ d.T - (o * d).sum(1)   # (P,R)
     aside = (centre ** 2).sum(1)[:, None] - 2 * centre @ o.T + (o * o).sum(1) - along ** 2
     for i, (shape, *_, half, bottom, top, depth, _) in enumerate(parts):
         extent = max(bottom, top), half * (shape < 3), depth if shape == 1 else 0
-        radius = np.linalg.norm(extent)   # of the bounding sphere
-        rows = np.flatnonzero((aside[i] < radius ** 2) & (np.abs(along[i]) < radius + t))
+        radius = norm(extent)   # of the bounding sphere
+        rows = np.flatnonzero((aside[i] < radius ** 2) & (abs(along[i]) < radius + t))
         enter = enter_part(parts[i], o[rows] - centre[i], d[rows])
         hit = enter < t[rows]
         t[rows[hit]] = enter[hit]
@@ -346,29 +346,29 @@ def sky(d):
     """Radiance of the sky and two ranges of hills. d (R,3) -> (R,3) linear"""
     up = d[:, 2:]
     azimuth = np.arctan2(d[:, :1], d[:, 1:2])
-    colour = (.58, .68, .78) + np.clip(up * 1.5, 0, 1) * (-.52, -.46, -.26)
+    colour = (.58, .68, .78) + clip(up * 1.5, 0, 1) * (-.52, -.46, -.26)
     far_hills = .11, .045, 5, (.25, .33, .45)
     near_hills = .06, .03, 9, (.11, .18, .16)
     for base, size, waves, hill in (far_hills, near_hills):
         ridge = np.sin(waves * azimuth + base * 40) + 0.6 * np.sin(2.3 * waves * azimuth)
-        colour = np.where(up < base + size * ridge, hill, colour)
+        colour = where(up < base + size * ridge, hill, colour)
     return colour
 
 
 def paint(x, part, is_ground):
     """Solid texture of cells at points of the surface: x (H,3), part (H,9) -> (H,3)"""
-    square = np.where(np.hypot(x[:, 0], x[:, 1]) < 2.6, PAVING, MEADOW)
-    look = LOOKS[np.where(is_ground, square, part[:, 8]).astype(int)]
+    square = where(hypot(x[:, 0], x[:, 1]) < 2.6, PAVING, MEADOW)
+    look = LOOKS[where(is_ground, square, part[:, 8]).astype(int)]
     colour, width, height, contrast, windows = np.split(look, [3, 4, 5, 6], axis=1)
     turn = np.arctan2(x[:, 1] - part[:, 2], x[:, 0] - part[:, 1])
-    across = np.where(part[:, 0] == 1, x[:, 0] + x[:, 1], turn)
-    across = np.where(is_ground, x[:, 0], across)
-    row = np.where(is_ground, x[:, 1], x[:, 2])[:, None] / height
+    across = where(part[:, 0] == 1, x[:, 0] + x[:, 1], turn)
+    across = where(is_ground, x[:, 0], across)
+    row = where(is_ground, x[:, 1], x[:, 2])[:, None] / height
     bond = (np.floor(row) % 2 / 2) * (1 - windows)   # every other row of stones is shifted
     column = across[:, None] / width + bond
     seed = 12.9898 * np.floor(column) + 78.233 * np.floor(row)
-    chance = np.abs(np.sin(seed)) * 437.585 % 1
-    is_window = (np.abs(column % 1 - .5) < .2) * (np.abs(row % 1 - .45) < .28)
+    chance = abs(np.sin(seed)) * 437.585 % 1
+    is_window = (abs(column % 1 - .5) < .2) * (abs(row % 1 - .45) < .28)
     dark = windows * is_window
     return colour * ((1 + contrast * (2 * chance - 1)) * (1 - .8 * dark))
 
@@ -377,18 +377,18 @@ def shade(o, d, parts, background, sun):
     """Radiance along rays: sun, shadow, sky light and haze. o, d (R,3), sun (3,) -> (R,3) linear"""
     colour = sky(d) * background
     t, which = trace(o, d, parts, background)
-    hit = np.flatnonzero(t < np.inf)
+    hit = np.flatnonzero(t < inf)
     x = o[hit] + t[hit, None] * d[hit]
     part = parts[which[hit]]   # (H,9)
     is_ground = which[hit] < 0
     steps = 1e-5 * np.eye(3)
     normal = np.stack([part_sdf(part, x + e) - part_sdf(part, x - e) for e in steps], 1) / 2e-5
-    normal = np.where(is_ground[:, None], (0, 0, 1), normal)
+    normal = where(is_ground[:, None], (0, 0, 1), normal)
     to_sun = np.broadcast_to(sun, x.shape)
-    in_sun = trace(x + 1e-4 * normal, to_sun, parts, background)[0] == np.inf
-    light = (np.clip(normal @ sun, 0, None) * in_sun)[:, None] * (1.15, 1.05, .88)
+    in_sun = trace(x + 1e-4 * normal, to_sun, parts, background)[0] == inf
+    light = (clip(normal @ sun, 0, None) * in_sun)[:, None] * (1.15, 1.05, .88)
     light += (0.20 + 0.10 * normal[:, 2:]) * (.8, .92, 1.15)
-    haze = np.exp(-np.maximum(t[hit, None] - 5, 0) / 20)
+    haze = np.exp(-maximum(t[hit, None] - 5, 0) / 20)
     colour[hit] = haze * paint(x, part, is_ground) * light + (1 - haze) * (.42, .50, .58)
     return colour
 
@@ -397,34 +397,34 @@ def rays(K, c2w, w, h, dx=0.5, dy=0.5):
     """Unit directions of a photo's pixels in world axes, row by row. -> (h*w,3)"""
     v, u = np.mgrid[:h, :w].reshape(2, -1)
     d = np.stack([(u + dx - K[2]) / K[0], (v + dy - K[3]) / K[1], np.ones(w * h)], 1)
-    return (d / np.linalg.norm(d, axis=1, keepdims=True)) @ c2w[:, :3].T
+    return (d / norm(d, axis=1, keepdims=True)) @ c2w[:, :3].T
 
 
 def project(K, c2w, x):
     """Pixels (P,2), -1e9 behind the camera, and distances (P,) of points x (P,3)."""
     p = (x - c2w[:, 3]) @ c2w[:, :3]
-    z = np.where(p[:, 2:] > 1 / FAR, p[:, 2:], np.nan)
+    z = where(p[:, 2:] > 1 / FAR, p[:, 2:], np.nan)
     uv = p[:, :2] / z * K[:2] + K[2:]
-    return np.nan_to_num(uv, nan=-1e9), np.linalg.norm(p, axis=1)
+    return np.nan_to_num(uv, nan=-1e9), norm(p, axis=1)
 
 
 def toy_camera(rng, azimuth, size):
     """A tourist at `azimuth` [rad] from the front. -> K (4,), c2w (3,4) in the toy's units, w, h"""
     aspect = rng.choice([4 / 3, 3 / 2, 1.1, 3 / 4, 2 / 3])
-    w, h = np.round(size * np.minimum((aspect, 1), (1, 1 / aspect))).astype(int)
+    w, h = np.round(size * minimum((aspect, 1), (1, 1 / aspect))).astype(int)
     angle = np.radians(rng.uniform(40, 65))   # of view, along the long side
     f = size / 2 / np.tan(angle / 2)
     target = (0, .05, .80) + rng.uniform(-.12, .12, 3)
-    away = np.array([np.sin(azimuth), -np.cos(azimuth), rng.uniform(-.15, .45)])
+    away = array([np.sin(azimuth), -np.cos(azimuth), rng.uniform(-.15, .45)])
     away = away * f / min(w, h) * rng.uniform(2.0, 2.6)
     eye = target + away * rng.choice((0.8, 1), p=(.1, .9))
     eye[2] = max(eye[2], 0.2)
-    z = (target - eye) / np.linalg.norm(target - eye)
+    z = (target - eye) / norm(target - eye)
     lean = rng.normal(0, .03, 2)   # hardly anyone holds it level
     x = np.cross(z, (*lean, 1))
-    x /= np.linalg.norm(x)
+    x /= norm(x)
     c2w = np.stack([x, np.cross(z, x), z, eye], 1)
-    return np.array([f, f, w / 2, h / 2]), c2w, w, h
+    return array([f, f, w / 2, h / 2]), c2w, w, h
 
 
 def draw_people(rng, w, h, share):
@@ -435,10 +435,10 @@ def draw_people(rng, w, h, share):
         if left <= max(0.1 * share, 0.002):
             break
         tall = np.sqrt(left * w * h / .25) * rng.uniform(.5, 1)
-        tall = 4 * np.clip(tall, .12 * h, .95 * h)
+        tall = 4 * clip(tall, .12 * h, .95 * h)
         feet = rng.uniform((0, 3.2 * h), (4 * w, 4 * h + .2 * tall))
         coat, legs, thing, skin = .02 + .83 * rng.beta(.4, .4, (4, 3))   # vivid, black or white
-        skin = (.3 + skin[0]) * np.array([.8, .6, .45])
+        skin = (.3 + skin[0]) * array([.8, .6, .45])
         stripe = thing if rng.random() < .4 else coat
         spot = rng.uniform((-.25, .5), (.25, 1.15))   # of a bag, balloon or hat
         # Strokes: colour, both ends x y and width, in heights of the person above the feet.
@@ -449,7 +449,7 @@ def draw_people(rng, w, h, share):
         end = spot + rng.uniform(-.15, .15, 2)
         strokes.append((thing, *spot, *end, rng.uniform(.08, .25)))
         for colour, x0, y0, x1, y1, wide in strokes:
-            ends = feet + np.array([(x0, y0), (x1, y1)]) * (tall, -tall)
+            ends = feet + array([(x0, y0), (x1, y1)]) * (tall, -tall)
             thickness = int(wide * tall) + 1
             cv2.line(canvas, *ends.astype(int).tolist(), (*colour.tolist(), 1), thickness)
     small = cv2.resize(canvas, (w, h), interpolation=cv2.INTER_AREA)
@@ -462,36 +462,30 @@ def toy_points(rng, views, depths, people, count=3000):
     for (K, c2w, w, h), depth, hidden in zip(views, depths, people):
         surface = c2w[:, 3] + rays(K, c2w, w, h) * depth[:, None]
         ok = (depth < 30) & ~hidden
-        on = ok & (surface[:, 2] > .02) & (np.abs(surface[:, :2]) < 1.3).all(1)   # the landmark
+        on = ok & (surface[:, 2] > .02) & (abs(surface[:, :2]) < 1.3).all(1)   # the landmark
         for some, n in (on, count // len(views)), (ok & ~on, count // 5 // len(views)):
             x.append(surface[rng.choice(np.flatnonzero(some), n * some.any())])
-    x = np.concatenate(x)
+    x = concatenate(x)
     tracks = []
     for (K, c2w, w, h), depth, hidden in zip(views, depths, people):
         uv, distance = project(K, c2w, x)
-        at = np.clip(uv, 0, (w - 1, h - 1)).astype(int) @ (1, w)
+        at = clip(uv, 0, (w - 1, h - 1)).astype(int) @ (1, w)
         ok = ((uv >= 0) & (uv < (w, h))).all(1)
-        ok &= np.abs(depth[at] / distance - 1) < .02
+        ok &= abs(depth[at] / distance - 1) < .02
         ok &= ~hidden[at] & (rng.random(len(x)) < .6)
         tracks.append(np.flatnonzero(ok))
     is_wrong = rng.random((len(x), 1)) < .015
     x += is_wrong * rng.uniform(-1, 1, x.shape)
     x = (x + rng.normal(0, .005, x.shape)) * TOY_SCALE + TOY_ORIGIN
-    counts = np.bincount(np.concatenate(tracks), minlength=len(x))
+    counts = np.bincount(concatenate(tracks), minlength=len(x))
     return np.column_stack([x, 0 * counts, counts]), tracks
-
-
-def turn_sun(degrees):
-    """The sun, its azimuth turned."""
-    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
-    return np.array([c * SUN[0] - s * SUN[1], s * SUN[0] + c * SUN[1], SUN[2]])
 
 
 def shake_camera(rng, K, c2w, pixels):
     """Moves c2w, in the toy's units, by noise that is `pixels` rms at the landmark."""
     *turn, dx, dy = rng.normal(0, pixels / 2, 4) / K[0]   # half by turning, half by moving [rad]
-    c2w[:, 3] += c2w[:, :2] @ (dx, dy) * np.linalg.norm(c2w[:, 3])
-    c2w[:, :3] = c2w[:, :3] @ cv2.Rodrigues(np.array([*turn, 0]))[0]
+    c2w[:, 3] += c2w[:, :2] @ (dx, dy) * norm(c2w[:, 3])
+    c2w[:, :3] = c2w[:, :3] @ cv2.Rodrigues(array([*turn, 0]))[0]
 
 
 def make_toy(seed=0, size=96, photos=48, test=8, occluders=0.05, exposure=1.0, pose_noise=0.0,
@@ -501,14 +495,11 @@ def make_toy(seed=0, size=96, photos=48, test=8, occluders=0.05, exposure=1.0, p
     of brightness, white balance and contrast, 0 none, 1 tourists, 2 extreme. pose_noise: of the
     training photos [px rms at the landmark]. background=False: nothing else, before black. sun: its
     azimuth differs from photo to photo by up to this many degrees."""
-    knobs = dict(locals())
-    info = dict(scene="toy", kind="toy", downscale=1, folder=None, split=None)
-    info.update(knobs)
-    rule = "the toy needs occluders in 0..0.6, exposure in 0..2, sun in 0..180, size >= 16, "
-    rule += "photos >= 4, and no other number below 0"
-    check(0 <= occluders <= 0.6 and 0 <= exposure <= 2 and 0 <= sun <= 180, rule)
-    check(size >= 16 and photos >= 4 and 0 <= pose_noise < np.inf, rule)
-    check(min(test, seed, landmark) >= 0, rule)
+    info = dict(locals(), scene="toy", kind="toy", downscale=1, folder=None, split=None)
+    is_sound = occluders <= 0.6 and exposure <= 2 and sun <= 180 and pose_noise < inf
+    is_sound &= min(seed, test, occluders, exposure, pose_noise, landmark, sun) >= 0
+    check(is_sound and size >= 16 and photos >= 4, "the toy needs occluders in 0..0.6, exposure in "
+          "0..2, sun in 0..180, size >= 16, photos >= 4, and no other number below 0")
     streams = [np.random.default_rng([seed, k]) for k in range(6)]   # no knob moves another
     camera, taste, people, sfm, shake, day = streams
     count = photos + test
@@ -516,22 +507,21 @@ def make_toy(seed=0, size=96, photos=48, test=8, occluders=0.05, exposure=1.0, p
     views = [toy_camera(camera, angle, size) for angle in np.radians(angles)]
     is_test = np.isin(np.arange(count), (np.arange(test) + 0.5) * count // max(test, 1))
     share = people.gamma(0.8 + 6 * occluders, size=count) * ~is_test   # some photos stay free
-    share = np.minimum(share / share.sum() * photos * occluders, 0.85)
-    suns = [turn_sun(sun * turn) for turn in day.uniform(-1, 1, count)]
+    share = minimum(share / share.sum() * photos * occluders, 0.85)
+    turns = np.radians(day.uniform(-sun, sun, count))
+    suns = [cv2.Rodrigues(array([0, 0, turn]))[0] @ SUN for turn in turns]
     parts = toy_parts(landmark, background)
     images, depth, occluder = [], [], []
     for i in progress(range(count), "drawing photos"):
         K, c2w, w, h = views[i]
         o = np.broadcast_to(c2w[:, 3], (w * h, 3))
-        linear = 0
-        for dx, dy in itertools.product((.25, .75), repeat=2):
-            radiance = shade(o, rays(K, c2w, w, h, dx, dy), parts, background, suns[i])
-            linear = linear + np.clip(radiance, 0, 1)
+        d = [rays(K, c2w, w, h, *at) for at in itertools.product((.25, .75), repeat=2)]
+        linear = sum(clip(shade(o, to, parts, background, suns[i]), 0, 1) for to in d)
         cover = draw_people(people, w, h, share[i])
         linear = linear / 4 * (1 - cover[:, 3:]) + cover[:, :3]   # (h*w,3)
         tint = exposure * taste.uniform(-1, 1, 4)
         balance = 1 + .1 * tint[1:3] @ [[1, 0, 0], [0, 0, 1]]   # of red and blue
-        bright = np.clip(linear * (2 ** (tint[0] / 2) * balance), 0, 1)
+        bright = clip(linear * (2 ** (tint[0] / 2) * balance), 0, 1)
         srgb = bright ** (1.2 ** tint[3] / 2.2)
         images.append((srgb * 255 + 0.5).astype(np.uint8).reshape(h, w, 3))
         depth.append(trace(o, rays(K, c2w, w, h), parts, background)[0])
@@ -541,16 +531,16 @@ def make_toy(seed=0, size=96, photos=48, test=8, occluders=0.05, exposure=1.0, p
         shake_camera(shake, K, c2w, pose_noise * (not held_out))
         c2w[:, 3] = c2w[:, 3] * TOY_SCALE + TOY_ORIGIN
     building = parts[:len(LANDMARK)]   # all of it belongs in the unit sphere
-    radius, depth_y, half = building[:, [5]], building[:, [7]], building[:, [4]]
-    extent = np.hstack([radius, np.where(depth_y < np.inf, depth_y, radius), half])
+    extent = building[:, [5, 7, 4]]
+    extent = where(extent < inf, extent, building[:, [5]])   # columns and balls are round
     corners = [building[:, 1:4] + extent * signs for signs in itertools.product((-1, 1), repeat=3)]
-    contain = np.concatenate(corners) * TOY_SCALE + TOY_ORIGIN
+    contain = concatenate(corners) * TOY_SCALE + TOY_ORIGIN
     K, c2w, *_ = zip(*views)
     name = [f"toy_{i:03d}.png" for i in range(count)]
     scene = finish(images, K, c2w, is_test, name, points, tracks, info, contain)
-    depth = np.concatenate(depth) * TOY_SCALE / scene["scale"]
+    depth = concatenate(depth) * TOY_SCALE / scene["scale"]
     scene["depth"] = depth.astype(np.float16)
-    scene["occluder"] = np.concatenate(occluder)
+    scene["occluder"] = concatenate(occluder)
     return scene
 
 
@@ -560,7 +550,7 @@ def choose_points(points):
     error, views = points[:, 3], points[:, 4]
     usable = views >= (3 if (views >= 3).sum() >= 500 else 2)
     check(usable.sum() >= 20, f"{usable.sum()} usable 3D points: SfM needs more overlapping photos")
-    return usable & (error <= np.quantile(error[usable], 0.95))
+    return usable & (error <= quantile(error[usable], 0.95))
 
 
 def find_sphere(x, weight, tracks, is_test, contain=()):
@@ -569,20 +559,20 @@ def find_sphere(x, weight, tracks, is_test, contain=()):
     Centre: geometric median of points x (K,3) by weight. Radius: 1.1 x the distance of 95 %. If that
     is a skyline, more than four times the median distance away, only nearer points are counted.
     Inside are at least 30 % of the points (M,) of most training photos, and contain (P,3)."""
-    centre = np.median(x, axis=0)
+    centre = median(x, axis=0)
     for _ in range(20):   # Weiszfeld
-        w = weight / np.maximum(np.linalg.norm(x - centre, axis=1), 1e-9)
+        w = weight / maximum(norm(x - centre, axis=1), 1e-9)
         centre = w @ x / w.sum()
-    distance = np.linalg.norm(x - centre, axis=1)   # (K,)
+    distance = norm(x - centre, axis=1)   # (K,)
     counted = np.repeat(distance, weight)
-    limit = 4 * np.median(counted)
-    if np.quantile(counted, 0.95) > limit:
+    limit = 4 * median(counted)
+    if quantile(counted, 0.95) > limit:
         counted = counted[counted <= limit]
-    radius = 1.1 * np.quantile(counted, 0.95, method="inverted_cdf")
+    radius = 1.1 * quantile(counted, 0.95, method="inverted_cdf")
     training = [own for own, held_out in zip(tracks, is_test) if len(own) and not held_out]
     check(training, "no training photo observes a usable 3D point: they do not belong together")
-    reach = np.median([np.quantile(distance[own], 0.3) for own in training])
-    corners = np.linalg.norm(np.reshape(contain, (-1, 3)) - centre, axis=1)
+    reach = median([quantile(distance[own], 0.3) for own in training])
+    corners = norm(np.reshape(contain, (-1, 3)) - centre, axis=1)
     radius = max(radius, reach, *1.02 * corners)
     check(radius > 1 / FAR, "all 3D points coincide: run SfM again")
     return centre, radius
@@ -600,18 +590,18 @@ def finish(images, K, c2w, is_test, name, points, tracks, info, contain=()):
         own = own[usable[own] & (rng.random(len(own)) < share)]
         kept.append(new_index[own])
     x = points[usable, :3]
-    weight = np.minimum(points[usable, 4], 20).astype(int)
+    weight = minimum(points[usable, 4], 20).astype(int)
     centre, radius = find_sphere(x, weight, kept, is_test, contain)
-    c2w = np.array(c2w)
+    c2w = array(c2w)
     c2w[:, :, 3] = (c2w[:, :, 3] - centre) / radius
     arrays = dict(
-        rgb=np.concatenate([image.reshape(-1, 3) for image in images]),
+        rgb=concatenate([image.reshape(-1, 3) for image in images]),
         wh=[image.shape[1::-1] for image in images],
         start=np.cumsum([0, *(image.size // 3 for image in images)]),
         K=K, c2w=c2w, is_test=is_test, name=name, info=json.dumps(info),
         points=(x - centre) / radius, center=centre, scale=radius,
         track_photo=np.repeat(np.arange(len(c2w)), [len(own) for own in kept]),
-        track_point=np.concatenate(kept))
+        track_point=concatenate(kept))
     scene = {key: np.asarray(value, FORMAT[key].split()[0]) for key, value in arrays.items()}
     return statistics(scene)
 
@@ -630,36 +620,36 @@ def statistics(scene):
     seen, size, bright, beyond = [], [], [], []   # of the training photos
     for i, own in enumerate(tracks):
         uv, distance = project(K[i], c2w[i], points[own])
-        places.append(np.clip(uv / wh[i], -1, 2))
-        near.append(max(0.8 * np.quantile(distance, 0.02), 0.02) if len(own) else 0.05)
+        places.append(clip(uv / wh[i], -1, 2))
+        near.append(max(0.8 * quantile(distance, 0.02), 0.02) if len(own) else 0.05)
         if scene["is_test"][i]:
             continue
         photo = rgb[scene["start"][i]:scene["start"][i + 1]]
-        u, v = np.clip(uv, 0, wh[i] - 1).astype(int).T
+        u, v = clip(uv, 0, wh[i] - 1).astype(int).T
         seen.append(own)
         size.append(distance / K[i, 0])
         bright.append(photo[v * wh[i, 0] + u].mean(1) / 255)
         o, d = c2w[i, :, 3], rays(K[i], c2w[i], *wh[i])
-        closest = o - np.minimum(d @ o, 0)[:, None] * d   # to the centre, along each ray
-        misses = np.linalg.norm(closest, axis=1) > 1
+        closest = o - minimum(d @ o, 0)[:, None] * d   # to the centre, along each ray
+        misses = norm(closest, axis=1) > 1
         beyond.append(photo[misses][::step])
-    every, size, beyond = np.concatenate(seen), np.concatenate(size), np.concatenate(beyond)
-    mean = np.bincount(every, np.concatenate(bright)) / np.maximum(np.bincount(every), 1)   # (K,)
-    offsets = [np.median(b - mean[own]) for b, own in zip(bright, seen) if len(own)]
+    every, size, beyond = concatenate(seen), concatenate(size), concatenate(beyond)
+    mean = np.bincount(every, concatenate(bright)) / maximum(np.bincount(every), 1)   # (K,)
+    offsets = [median(b - mean[own]) for b, own in zip(bright, seen) if len(own)]
     color = np.full(3, np.nan)
     if len(beyond) > 100:   # fewer may all be people
-        median = np.median(beyond, 0)
-        agree = (np.abs(beyond - median) < 5.1).all(1)
+        usual = median(beyond, 0)
+        agree = (abs(beyond - usual) < 5.1).all(1)
         if agree.sum() > 0.6 * len(beyond):
-            color = median / 255
-    inside = np.linalg.norm(scene["points"][every], axis=1) < 1
+            color = usual / 255
+    inside = norm(scene["points"][every], axis=1) < 1
     if inside.any():
         size = size[inside]
     else:
-        size = np.linalg.norm(c2w[:, :, 3], axis=1) / K[:, 0]
+        size = norm(c2w[:, :, 3], axis=1) / K[:, 0]
     scene["near"] = np.float32(near)
-    scene["track_uv"] = np.concatenate(places, dtype=np.float32)
-    scene["footprint"] = np.quantile(size, 0.25)
+    scene["track_uv"] = concatenate(places, dtype=np.float32)
+    scene["footprint"] = quantile(size, 0.25)
     scene["exposure_spread"] = np.std(offsets)
     scene["bg_color"] = color
     return scene
@@ -675,14 +665,13 @@ FOCAL_LENGTHS = {0: 1, 1: 2, 2: 1, 3: 1, 4: 2, 6: 2}   # not of fisheye and othe
 
 @dataclass
 class Photo:
-    """A photo as a model has it. wh (w,h); K (4,), c2w (3,4) and bend, k1 k2 p1 p2 k3 .. k6 of
-    OpenCV, are None if fault, a sentence about the photo, says why it cannot be used."""
-    fault: str = ""
+    """A photo as a model has it, in SfM units; what it lacks is None if it has a fault."""
+    fault: str = ""   # a sentence about the photo: why it cannot be used
     wh: tuple = ()
-    K: np.ndarray = None
-    bend: np.ndarray = None
-    c2w: np.ndarray = None
-    point_ids: tuple = ()
+    K: np.ndarray = None   # (4,)
+    bend: np.ndarray = None   # k1 k2 p1 p2 k3 .. k6 of OpenCV
+    c2w: np.ndarray = None   # (3,4)
+    points: list = ()   # ids, then rows, of the points that it observes
 
 
 def open_binary(path):
@@ -707,12 +696,12 @@ def read_cameras(sparse):
         key, model, w, h = read("IiQQ")
         is_known = 0 <= model < len(PARAMETERS)
         check(is_known, f"{sparse} has camera model {model}, which is unknown: {undistort}")
-        numbers = np.array(read(f"{PARAMETERS[model]}d"))
+        numbers = array(read(f"{PARAMETERS[model]}d"))
         n = FOCAL_LENGTHS.get(model)
         if n is None:
             cameras[key] = Photo(f"has a fisheye or other camera of model {model}: {undistort}")
             continue
-        is_sound = (np.abs(numbers) < FAR).all() and min(numbers[:n]) > 1 / FAR   # false for nan
+        is_sound = (abs(numbers) < FAR).all() and min(numbers[:n]) > 1 / FAR   # false for nan
         if not is_sound or not (0 < w < 32767 and 0 < h < 32767):
             fault = f"has camera {key} of {w} x {h} with {numbers.tolist()}, which cannot be"
             cameras[key] = Photo(f"{fault}: export the model again")
@@ -742,17 +731,17 @@ def read_photos(sparse):
         if not is_sound:
             photo = Photo("has no sound pose: run SfM again")
         if not photo.fault:
-            w, *v = np.array(pose[:4]) / math.hypot(*pose[:4])   # old files are not normalised
+            w, *v = array(pose[:4]) / math.hypot(*pose[:4])   # old files are not normalised
             cross = np.cross(v, np.eye(3))
             R = np.eye(3) + 2 * w * cross + 2 * cross @ cross   # camera to world
             c2w = np.column_stack([R, -R @ pose[4:]])
-            photo = Photo("", photo.wh, photo.K, photo.bend, c2w, ids.tolist())
+            photo = replace(photo, c2w=c2w, points=ids.tolist())
         photos[name] = photo
     return photos
 
 
 def read_points(sparse):
-    """Points (K,5) of a COLMAP model, as in finish, and {id: row}."""
+    """Points (K,5) of a COLMAP model, as in finish, and {id: row} of them."""
     path = sparse / "points3D.bin"
     triangulate = f"run colmap point_triangulator with --input_path {sparse}"
     check(path.is_file(), f"{path} is missing: {triangulate}")
@@ -765,22 +754,23 @@ def read_points(sparse):
         if all(abs(value) < FAR for value in (x, y, z, error)):   # false for nan
             rows[key] = len(points)
             points.append((x, y, z, error, views))
-    points = np.array(points, float).reshape(-1, 5)
+    points = array(points, float).reshape(-1, 5)
     has_tracks = (points[:, 4] > 1).any()
     check(has_tracks, f"{path} has {len(points)} points, none with a track: {triangulate}")
     return points, rows
 
 
-def share_in_photo(points, photos, tracks):
+def share_in_photo(points, photos):
     """Share of the sightings that the poses put into the photo that saw them, spread over it."""
     inside = []
-    for photo, own in zip(photos, tracks):
-        place = project(photo.K, photo.c2w, points[own, :3])[0] / photo.wh
+    for photo in photos:
+        uv, _ = project(photo.K, photo.c2w, points[photo.points, :3])
+        place = uv / photo.wh
         ok = ((place >= 0) & (place <= 1)).all(1)
         if ok.sum() > 20 and np.ptp(place[ok], axis=0).max() < .02:
             ok[:] = False   # all at one place: points in smaller units than the poses
         inside.append(ok)
-    return np.concatenate(inside).mean()
+    return concatenate(inside).mean()
 
 
 def photo_files(folder):
@@ -788,219 +778,216 @@ def photo_files(folder):
     files = {}
     for path in sorted(folder.rglob("*")):
         name = path.relative_to(folder)
-        is_hidden = path.name.startswith(".") or name.parts[0] == "dense"
-        if path.suffix.lower() in PHOTO_TYPES and not is_hidden:
+        is_photo = path.suffix.lower() in PHOTO_TYPES and path.name[0] != "."
+        if is_photo and name.parts[0] != "dense":
             files[name.as_posix()] = path
     return files
+
+
+def renamed(names, files):
+    """Says how names that are no file's come to be so, if folder or extension is all there is."""
+    stems = {stem(file): file for file in files}
+    pairs = [f"{name} is {stems[stem(name)]}" for name in names if stem(name) in stems]
+    return f" by another folder or extension ({', '.join(pairs[:3])})" if pairs else ""
 
 
 def stem(name):
     return Path(name.replace("\\", "/")).stem.lower()
 
 
-def match(names, known):
-    """{name: the same in `known`, or the only one there by another folder or extension}"""
-    found = {name: name for name in names if name in known}
-    missing = collections.Counter(stem(name) for name in names if name not in found)
-    free = collections.defaultdict(list)
-    for name in known:
-        if name not in found:
-            free[stem(name)].append(name)
-    for name in names:
-        others = free[stem(name)]
-        if name not in found and len(others) == missing[stem(name)] == 1:
-            found[name] = others[0]
-    return found
-
-
-def warn_renamed(found, what):
-    renamed = [f"{name} as {other}" for name, other in found.items() if name != other]
-    if renamed:
-        warn(f"{len(renamed)} {what} by another folder or extension: {', '.join(renamed[:3])} ...")
-
-
-def model_folders(folder, ending="bin"):
+def model_folders(folder, name="images.bin"):
     """Folders with COLMAP models, at most four levels down; links are followed."""
-    places = {path.parent for depth in range(5) for path in folder.glob("*/" * depth + f"images.{ending}")}
-    return sorted(places, key=lambda place: (len(place.parts), place))
+    found = [path.parent for depth in range(5) for path in folder.glob("*/" * depth + name)]
+    return sorted(found, key=lambda place: (len(place.parts), place))
 
 
 @dataclass
 class Model:
-    """A COLMAP model: its photos {name: Photo}, and the files {name: path} of those on disk."""
     sparse: Path
-    photos: dict
-    images: Path = None
-    on_disk: int = 0
-    files: dict = None
+    photos: dict   # {name: Photo}
+    images: Path   # that folder of photos around it in which most of its photos are
+    files: dict   # {name: path} of all photos there
+
+    def __post_init__(self):
+        self.names = sorted(self.photos.keys() & self.files.keys())
 
 
 def open_model(folder, sparse):
-    """The model, with that folder of photos around it in which most of its photos are."""
-    model = Model(sparse, read_photos(sparse), files={})
+    photos = read_photos(sparse)
     around = [sparse, *sparse.parents]
     around = around[:around.index(folder) + 1]
-    for place, name in itertools.product(around, ("images", "input", "")):
-        files = photo_files(place / name)
-        found = match(model.photos, files)
-        if len(found) > len(model.files):
-            model.images = place / name
-            model.on_disk = len(files)
-            model.files = {name: files[other] for name, other in found.items()}
-            renamed = found
-    if model.files:
-        warn_renamed(renamed, f"photos of {sparse} are on disk")
-    return model
+    places = [place / name for place in around for name in ("images", "input", "")]
+    models = [Model(sparse, photos, place, photo_files(place)) for place in places]
+    return max(models, key=lambda model: len(model.names))
+
+
+def rank(model):
+    """Usable photos, and those of them without distortion."""
+    usable = [model.photos[name] for name in model.names if not model.photos[name].fault]
+    return len(usable), sum(not photo.bend.any() for photo in usable)
 
 
 def find_model(folder, command):
-    """The model of the folder with most usable photos; says what that leaves out."""
+    """The model in the folder with most usable photos; says what that leaves out."""
     places = model_folders(folder)
-    for text in model_folders(folder, "txt"):
-        check(places, f"{text} is a model as text: run colmap model_converter --input_path {text} "
-              f"--output_path {text} --output_type BIN")
+    texts = model_folders(folder, "images.txt")
+    check(places or not texts, f"{folder} has models as text alone: run colmap model_converter "
+          f"--output_type BIN with input and output path {' or '.join(map(str, texts))}")
     check(places, f"{folder} has no COLMAP model; run: python data_prep.py {command}")
-    models = [open_model(folder, sparse) for sparse in places]
-
-    def rank(model):
-        photos = [model.photos[name] for name in model.files]
-        usable = [photo for photo in photos if not photo.fault]
-        return len(usable), sum(not photo.bend.any() for photo in usable)
+    models = [open_model(folder, place) for place in places]
     best = max(models, key=rank)
-    check(best.files, f"no photo of {best.sparse} is on disk: put them into {folder / 'images'}; "
-          f"or run: python data_prep.py {command}")
-    on_disk = max(model.on_disk for model in models)
-    others = [f"{model.sparse} {len(model.photos)}" for model in models
-              if model.photos.keys() != best.photos.keys()]
-    line = f"{best.images}: {on_disk} photos on disk, {len(best.files)} posed by {best.sparse}"
+    hint = renamed(best.photos, photo_files(folder))
+    check(best.names, f"no photo of {best.sparse} is on disk{hint}: put them into "
+          f"{folder / 'images'}, or run: python data_prep.py {command}")
+    on_disk = max(len(model.files) for model in models if model.names)
+    print(f"{best.images}: {on_disk} photos on disk, {len(best.names)} posed by {best.sparse}")
+    others = [model for model in models if model.photos.keys() != best.photos.keys()]
     if others:
-        line += f"; lost are other models: {', '.join(others)}"
-    print(line)
+        counts = [f"{len(model.photos)} by {model.sparse}" for model in others]
+        print(f"other models are left out: {', '.join(counts)} photos")
     return best
 
 
 def read_table(path):
-    """Rows of a .tsv or .csv file as dictionaries by the names of its columns."""
+    """Lines of a table of any separator, as lists of words."""
     data = path.read_bytes()
     is_wide = data[:2] in (b"\xff\xfe", b"\xfe\xff")
     lines = data.decode("utf-16" if is_wide else "utf-8-sig", "replace").splitlines()
     lines = [line for line in lines if line.strip()] or [""]
     mark = max("\t;,", key=lines[0].count)
-    rows = [[word.strip(' "') for word in line.split(mark)] for line in lines]
-    return [dict(zip(rows[0], row)) for row in rows[1:]], rows[0]
+    return [[word.strip(' "') for word in line.split(mark)] for line in lines]
 
 
 def read_split(path):
     """{name: "train" or "test"} of a table with NeRF-W's columns, without the rows with an empty
     id; or of train_list.txt and test_list.txt, one of which is `path`."""
     check(path.is_file(), f"the split file {path} is not there")
-    rows, head = read_table(path)
+    head, *rows = read_table(path)
     if path.suffix == ".txt" and "split" not in head:
+        head = "filename", "split"
         rows = []
         for part, other in ("train", "test"), ("test", "train"):
             table = path.with_name(path.name.replace(other, part))
-            check(table.is_file(), f"{table} is missing: each split needs both lists")
-            names, first = read_table(table)
-            rows += [dict(filename=name, split=part) for name in first]
-    else:
-        has_columns = {"filename", "split"} <= set(head)
-        check(has_columns, f"{path} needs a header with filename and split")
+            check(table.is_file(), f"{table} is missing: a split needs both lists")
+            rows += [(words[0], part) for words in read_table(table)]
+    check({"filename", "split"} <= set(head), f"{path} needs a header with filename and split")
     split = {}
-    for row in rows:
+    for words in rows:
+        row = dict(zip(head, words))
         name, part = row.get("filename"), row.get("split")
-        if row.get("id") == "":
-            continue
-        is_sound = name and part in ("train", "test") and split.setdefault(name, part) == part
-        check(is_sound, f"{path}: {name!r} is {part!r}; each photo is train or test, and not both")
+        if row.get("id") != "":
+            is_sound = name and part in ("train", "test") and split.get(name, part) == part
+            check(is_sound, f"{path}: {name!r} is {part!r}; each is train or test, and not both")
+            split[name] = part
     return split
 
 
-def find_split(folder, images):
-    """The split files of a folder that belong together; of several kinds the first one."""
-    for place, kind in itertools.product((folder, images.parent), ("*.tsv", "*.csv", "train*.txt")):
-        tables = [path for path in sorted(place.glob(kind)) if path.name[0] != "."]
+def find_split(folder):
+    """The split file of a folder, or one of its two lists."""
+    for kind in "*.tsv", "*.csv", "train*.txt":
+        tables = [path for path in sorted(folder.glob(kind)) if path.name[0] != "."]
         if kind == "*.csv":   # people keep other tables too
-            tables = [path for path in tables if "filename" in read_table(path)[1]]
+            tables = [path for path in tables if "filename" in read_table(path)[0]]
+        names = ", ".join(table.name for table in tables)
+        check(len(tables) < 2, f"{folder} has several split files ({names}): choose by --split")
         if tables:
-            names = ", ".join(table.name for table in tables)
-            check(len(tables) == 1, f"{place} has several split files ({names}): choose by --split")
             return tables[0]
-    return None
 
 
 def fingerprint(folder, images, split):
     """Of names, sizes and times of all files that a scene is read from."""
     paths = list(photo_files(images).values())
+    for pattern in "*.tsv", "*.csv", "t*.txt":
+        paths += folder.glob(pattern)
     for place in model_folders(folder):
         paths += place.glob("*.bin")
-    for place in (folder, images.parent):
-        paths += [path for kind in ("*.tsv", "*.csv", "*.txt") for path in place.glob(kind)]
     if split:
         paths.append(Path(split))
-    lines = []
-    for path in sorted(paths):
-        if path.exists():
-            lines.append(f"{path} {path.stat().st_size} {path.stat().st_mtime_ns}")
+    stats = [(path, path.stat()) for path in sorted(paths) if path.exists()]
+    lines = [f"{path} {stat.st_size} {stat.st_mtime_ns}" for path, stat in stats]
     return zlib.crc32(os.fsencode("\n".join(lines)))
 
 
 def decode(path):
     """The photo, BGR as OpenCV has it, unturned as COLMAP has it. -> uint8 (h,w,3)"""
     data = path.read_bytes()
-    # OpenCV says nothing where a file is cut off. A JPEG's last scan ends with an end mark.
-    is_jpeg = data[:2] == b"\xff\xd8"
-    is_png = data[1:4] == b"PNG"
-    is_whole = data.rfind(b"\xff\xd9") > data.rfind(b"\xff\xda") if is_jpeg else True
-    check(is_whole and (b"IEND" in data or not is_png), "is cut off: copy it again")
-    image = None
+    is_whole = True   # OpenCV says nothing where a file is cut off
+    if data[:2] == b"\xff\xd8":   # a JPEG: an end mark follows its last scan
+        is_whole = data.rfind(b"\xff\xd9") > data.rfind(b"\xff\xda")
+    if data[1:4] == b"PNG":
+        is_whole = b"IEND" in data
+    check(is_whole, "is cut off: copy it again")
+    flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
     try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-    except cv2.error as e:   # empty, or more than a gigapixel
-        raise UserError(f"cannot be read ({e.err}): replace it") from e
-    check(image is not None, "is no photo, or damaged: replace it")
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    except cv2.error:   # empty, or more than a gigapixel
+        image = None
+    check(image is not None, "is empty, damaged, too large or no photo: replace it")
     return image
 
 
 def read_photo(path, photo, downscale):
     """Undistorted, then reduced. -> rgb uint8 (h,w,3), K (4,)"""
     check(not photo.fault, photo.fault)
-    (w, h), K = photo.wh, photo.K
+    w, h = photo.wh
+    K = photo.K
     check(downscale <= min(w, h) / 2, f"is {w} x {h}: --downscale {downscale} leaves nothing of it")
     image = decode(path)
     size = image.shape[1::-1]
-    check(size == (w, h), f"has {size[0]} x {size[1]} pixels, its camera {w} x {h}: "
-          "put back the photos that SfM saw")
+    check(size == photo.wh, f"has {size[0]} x {size[1]} pixels, its camera {w} x {h}: put back the "
+          "photos that SfM saw")
     if photo.bend.any():   # OpenCV's first pixel is at 0
-        M = np.array([[K[0], 0, K[2] - 0.5], [0, K[1], K[3] - 0.5], [0, 0, 1]])
+        M = array([[K[0], 0, K[2] - 0.5], [0, K[1], K[3] - 0.5], [0, 0, 1]])
         P = cv2.getOptimalNewCameraMatrix(M, photo.bend, (w, h), 0)[0]   # shows nothing but photo
         if P[0, 0] <= M[0, 0] and P[1, 1] <= M[1, 1]:
             P = M
         image = cv2.undistort(image, M, photo.bend, None, P)
         K = P[[0, 1, 0, 1], [0, 1, 2, 2]] + (0, 0, 0.5, 0.5)
-    small = w // downscale, h // downscale
-    image = cv2.resize(image, small, interpolation=cv2.INTER_AREA)
-    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB), K * np.tile(np.array(small) / (w, h), 2)
+    small = array((w // downscale, h // downscale))
+    image = cv2.resize(image, small.tolist(), interpolation=cv2.INTER_AREA)
+    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB), K * np.tile(small / photo.wh, 2)
 
 
 def choose_parts(folder, model, split):
-    """{name: "train" or "test"} of the photos that are to be used, and {name: fault} of others."""
-    table = Path(split) if split else find_split(folder, model.images)
-    names = sorted(model.files)
+    """{name: "train" or "test"} of the photos that are to be used; says by which rule."""
+    table = Path(split) if split else find_split(folder)
     if table is None:
         print(f"{folder} has no split file: every eighth photo is held out")
-        return {name: "test" if i % 8 == 7 else "train" for i, name in enumerate(names)}, {}
+        return {n: "test" if i % 8 == 7 else "train" for i, n in enumerate(model.names)}
+    parts = read_split(table)
     print(f"split by {table}")
-    split = read_split(table)
-    found = match(split, model.files)
-    warn_renamed(found, f"photos of {table} are known")
-    parts = {other: split[name] for name, other in found.items()}
-    lost = split.keys() - found.keys()
-    faults = {name: "has no pose or no file" for name in lost if split[name] == "test"}
-    for out, why in (lost, "of the split file have no pose or no file"), (
-            model.files.keys() - parts.keys(), "are not in the split file"):
-        if out:
-            warn(f"{len(out)} photos {why}: {', '.join(sorted(out)[:3])} ...")
-    return parts, faults
+    lost = sorted(parts.keys() - set(model.names))
+    if lost:
+        hint = renamed(lost, model.names)
+        warn(f"{len(lost)} photos of {table} have no pose or no file{hint}: {lost[0]} ...")
+    rest = sorted(set(model.names) - parts.keys())
+    if rest:
+        warn(f"{len(rest)} photos are not in {table}: {', '.join(rest[:3])} ...")
+    return parts
+
+
+def read_usable(model, parts, downscale):
+    """{name: (rgb, K)} of the photos that can be used; says which cannot, and why."""
+    usable = {}
+    faults = {}
+    for name in progress(sorted(parts), "preparing photos"):
+        try:
+            check(name in model.names, "has no pose or no file")
+            photo = model.photos[name]
+            image, K = read_photo(model.files[name], photo, downscale)
+            angle = 2 * np.degrees(np.arctan(max(photo.wh / photo.K[:2]) / 2))
+            is_usual = parts[name] == "test" or 10 <= angle <= 120
+            check(is_usual, f"is {angle:.1f} degrees wide, which is not in 10..120")
+            usable[name] = image, K
+        except UserError as e:
+            faults[name] = f"{name} {e}"
+            warn(f"left out: {name} {e}")
+    lost = "; ".join(fault for name, fault in faults.items() if parts[name] == "test")
+    check(not lost, f"held-out photos cannot be used: {lost}; mend them, or hold out others")
+    count = sum(parts[name] == "train" for name in usable)
+    first = min(faults.values(), default="")
+    check(count >= 2, f"{count} usable training photos are too few; mend split file or photos: {first}")
+    return usable
 
 
 def prepare(name, downscale=2, split=None):
@@ -1014,51 +1001,28 @@ def prepare(name, downscale=2, split=None):
         command = f"{name} --download"
     model = find_model(folder, command)
     files = fingerprint(folder, model.images, split)
-    parts, lost_tests = choose_parts(folder, model, split)
+    parts = choose_parts(folder, model, split)
     points, rows = read_points(model.sparse)
     choose_points(points)   # fails before photos are read
-    tracks = {}
-    for name, photo in model.photos.items():
-        tracks[name] = np.array([rows[key] for key in photo.point_ids if key in rows], int)
-    sound = [name for name, photo in model.photos.items() if not photo.fault]
-    share = share_in_photo(points, [model.photos[n] for n in sound], [tracks[n] for n in sound])
-    check(share >= .5, f"{model.sparse}: only {share:.0%} of the sightings fall into the photo that "
-          "saw them: give poses as COLMAP does, world to camera, x right, y down, z forward, in "
-          "the units of the points")
+    sound = [photo for photo in model.photos.values() if not photo.fault]
+    for photo in sound:
+        photo.points = array([rows[key] for key in photo.points if key in rows], int)
+    share = share_in_photo(points, sound) if sound else 1
+    says = f"{share:.0%} of the sightings of {model.sparse} fall into the photo that saw them"
+    check(share >= .5, f"only {says}: give poses as COLMAP does, world to camera, x right, y down, "
+          "z forward, in the units of the points")
     if share < .9:
-        warn(f"{model.sparse}: only {share:.0%} of the sightings fall into the photo that saw them")
-    images, K, faults, used = [], [], {}, []
-    for name in progress(sorted(parts), "preparing photos"):
-        photo = model.photos[name]
-        try:
-            image, k = read_photo(model.files[name], photo, downscale)
-            angle = 2 * np.degrees(np.arctan(max(photo.wh / photo.K[:2]) / 2))
-            is_usual = parts[name] == "test" or 10 <= angle <= 120
-            check(is_usual, f"is narrower than 10 or wider than 120 degrees: {angle:.0f}")
-        except UserError as e:
-            faults[name] = str(e)
-            continue
-        used.append(name)
-        images.append(image)
-        K.append(k)
-    for name, fault in faults.items():
-        warn(f"left out: {name} {fault}")
-        if parts[name] == "test":
-            lost_tests[name] = fault
-    listed = "; ".join(f"{name} {fault}" for name, fault in lost_tests.items())
-    check(not lost_tests, f"held-out photos cannot be used: {listed}; mend them, or choose others "
-          "by a split file")
-    is_test = np.array([parts[name] == "test" for name in used], bool)
-    first = "".join(f"; {name} {fault}" for name, fault in list(faults.items())[:1])
-    check((~is_test).sum() >= 2, f"{folder} has {(~is_test).sum()} usable training photos of at "
-          f"least 2: check its split file and photos{first}")
+        warn(f"only {says}")
+    usable = read_usable(model, parts, downscale)
+    images, K = zip(*usable.values())
+    is_test = array([parts[name] == "test" for name in usable])
+    used = [model.photos[name] for name in usable]
     info = dict(scene=folder.resolve().name, kind="colmap", downscale=downscale,
                 folder=str(folder), split=split and str(Path(split).resolve()),
                 images=str(model.images), files=files)
-    c2w = [model.photos[name].c2w for name in used]
-    own = [tracks[name] for name in used]
-    scene = finish(images, K, c2w, is_test, used, points, own, info)
-    inside = (np.linalg.norm(scene["points"], axis=1) < 1).mean()
+    scene = finish(images, K, [photo.c2w for photo in used], is_test, list(usable), points,
+                   [photo.points for photo in used], info)
+    inside = (norm(scene["points"], axis=1) < 1).mean()
     print(f"the sphere has a radius of {scene['scale']:.3g} units of the reconstruction; "
           f"{inside:.0%} of the points are inside")
     return scene
@@ -1075,12 +1039,11 @@ def scene_path(name_or_folder):
 
 def is_fresh(info):
     """Whether the sources are what they were; a scene file also does without them."""
-    if info["kind"] == "toy" or not Path(info["folder"]).is_dir():
+    folder = Path(info["folder"])
+    if not folder.is_dir():
         return True
-    if "files" not in info:   # by an older version
-        return False
-    files = fingerprint(Path(info["folder"]), Path(info["images"]), info["split"])
-    return files == info["files"]
+    images = Path(info.get("images", ""))
+    return info.get("files") == fingerprint(folder, images, info["split"])
 
 
 def open_scene(name_or_folder, downscale=2):
