@@ -9,7 +9,6 @@ The landmark lies in the unit sphere. A ray is c2w[:, 3] + t * d with |d| = 1; a
 never a z-depth. Functions raise UserError, one sentence that says what to do.
 """
 import argparse
-import collections
 import gzip
 import http.client
 import inspect
@@ -27,8 +26,9 @@ import time
 import urllib.request
 import zipfile
 import zlib
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -85,8 +85,7 @@ def warn(message):
 def progress(items, what):
     """Yields items; says how far it is once that took ten seconds, or a minute in a log file."""
     is_terminal = sys.stdout.isatty()
-    wait = 1 if is_terminal else 60
-    due = 10 if is_terminal else 60
+    due, wait = (10, 1) if is_terminal else (60, 60)   # seconds
     begin = time.monotonic()
     total = len(items)
     for done, item in enumerate(items, 1):
@@ -96,9 +95,11 @@ def progress(items, what):
         if past > due or (is_last and past > 10):
             due = past + wait
             left = past / done * (total - done)
-            start = "\r" if is_terminal else ""
-            end = "" if is_terminal and not is_last else "\n"
-            print(f"{start}  {what}: {done} of {total}, {left:.0f} s left ", end=end, flush=True)
+            line = f"  {what}: {done} of {total}, {left:.0f} s left "
+            if is_terminal:
+                print("\r" + line, end="\n" if is_last else "", flush=True)
+            else:
+                print(line, flush=True)
 
 
 def atomic_write(path, write):
@@ -133,21 +134,18 @@ def refuse_bomb(path):
 def check_scene(scene):
     """UserError unless the arrays fit FORMAT and each other."""
     start, wh = scene["start"], scene["wh"]
-    photo, point = scene["track_photo"], scene["track_point"]
-    sizes = dict(I=len(wh), J=len(start), K=len(scene["points"]), T=len(photo), N=start[-1])
+    tracks = array([scene["track_photo"], scene["track_point"]])
+    counts = len(wh), len(scene["points"])
+    sizes = dict(zip("IJKTN", (len(wh), len(wh) + 1, counts[1], len(tracks[0]), start[-1])))
     for key, text in FORMAT.items():
         value = scene[key]
         dtype, _, letters = text.partition(" ")
         shape = tuple(sizes.get(letter) or int(letter) for letter in letters)
         check(value.shape == shape and str(value.dtype).startswith(dtype), key)
-        if dtype[0] == "f" and key != "bg_color":
-            check(np.isfinite(value).all(), key)
-    check(start[0] == 0 and (wh > 0).all(), "start")
-    check(np.array_equal(np.diff(start), wh.prod(1)), "start")
-    check(0 <= photo.min() and photo.max() < len(wh), "track_photo")
-    check(0 <= point.min() and point.max() < sizes["K"], "track_point")
-    check(min(scene["footprint"], scene["scale"]) > 0, "scale")
-    check(not scene["is_test"].all(), "is_test")
+        check(dtype[0] != "f" or key == "bg_color" or np.isfinite(value).all(), key)
+    check(start[0] == 0 and (wh > 0).all() and (np.diff(start) == wh.prod(1)).all(), "start")
+    check(tracks.min() >= 0 and (tracks.max(1) < counts).all(), "tracks")
+    check(min(scene["footprint"], scene["scale"]) > 0 and not scene["is_test"].all(), "scale")
     info = json.loads(str(scene["info"]))
     check({"kind", "scene", "downscale", "folder", "split"} <= set(info), "info")
 
@@ -169,17 +167,8 @@ TOY_SCALE = 3.7
 TOY_ORIGIN = array([12.0, -7.0, 5.0])
 SUN = array([-.50, -.62, .60]) / norm([-.50, -.62, .60])   # left, behind the tourists
 STONE, PALE, SAND, BRICK, ROOF, SLATE, COPPER, GOLD, HOUSE, LEAF, PAVING, MEADOW = range(12)
-WORDS = dict(box=1, column=2, ball=3, inf=inf, stone=STONE, pale=PALE, sand=SAND, brick=BRICK)
-WORDS.update(roof=ROOF, slate=SLATE, copper=COPPER, gold=GOLD)
-
-
-def table(text):
-    lines = text.strip().splitlines()
-    return array([[float(WORDS.get(word, word)) for word in line.split()] for line in lines])
-
-
 # Percent: colour, width and height of a cell, contrast of cells, has windows; a row a surface.
-LOOKS = table("""
+LOOKS = array("""
     50 46 40  29 13  20   0
     80 74 60  29 13   8   0
     78 56 30  30 30  15 100
@@ -192,39 +181,39 @@ LOOKS = table("""
     10 22  5  20 20  45   0
     48 42 34  42 42  20   0
     17 22  8  60 60  10   0
-""") / 100
+""".split(), float).reshape(-1, 7) / 100
 # Shape; centre x y z, half height, radius at the bottom and at the top, depth in thousandths; look.
-# A box (or roof) has |x| <= radius and |y| <= depth. Plinth, columns, hall; dome; tower; annex;
-# statue.
-LANDMARK = table("""
-    box     -10  -30   50   50  960  960  530  stone
-    box     -50    0  150   50  850  850  470  stone
-    column    0 -340  470  270   62   50  inf  pale
-    column    0 -340  470  270   62   50  inf  pale
-    column    0 -340  470  270   62   50  inf  pale
-    column    0 -340  470  270   62   50  inf  pale
-    column    0 -340  470  270   62   50  inf  pale
-    column    0 -340  470  270   62   50  inf  pale
-    box      30  200  530  330  590  590  260  sand
-    box      30   30  800   60  670  670  460  pale
-    box      30   30  980  120  710    0  480  roof
-    column  -50  220 1070  170  330  310  inf  sand
-    ball    -50  220 1240  300  300  300  inf  copper
-    column  -50  220 1570   70   75   65  inf  pale
-    column  -50  220 1700   60  100   20  inf  copper
-    ball    -50  220 1780   45   45   45  inf  gold
-    box     870  180  530  530  170  170  170  brick
-    box     870  180 1100   40  200  200  200  pale
-    column  870  180 1320  180  200    0  inf  slate
-    box    -760  240  380  180  190  190  250  brick
-    box    -760  240  650   90  230    0  280  slate
-    box    -800 -350  280   80   90   90   90  pale
-    column -800 -350  480  120   70   40  inf  copper
-    ball   -800 -350  640   55   55   55  inf  copper
-""") / (1, *[1000] * 7, 1)
+# Shape 1 is a box or roof, |x| <= radius and |y| <= depth; 2 a column or cone; 3 a ball. Plinth,
+# columns, hall; dome; tower; annex; statue.
+LANDMARK = array("""
+    1  -10  -30   50   50  960  960  530  0
+    1  -50    0  150   50  850  850  470  0
+    2    0 -340  470  270   62   50  inf  1
+    2    0 -340  470  270   62   50  inf  1
+    2    0 -340  470  270   62   50  inf  1
+    2    0 -340  470  270   62   50  inf  1
+    2    0 -340  470  270   62   50  inf  1
+    2    0 -340  470  270   62   50  inf  1
+    1   30  200  530  330  590  590  260  2
+    1   30   30  800   60  670  670  460  1
+    1   30   30  980  120  710    0  480  4
+    2  -50  220 1070  170  330  310  inf  2
+    3  -50  220 1240  300  300  300  inf  6
+    2  -50  220 1570   70   75   65  inf  1
+    2  -50  220 1700   60  100   20  inf  6
+    3  -50  220 1780   45   45   45  inf  7
+    1  870  180  530  530  170  170  170  3
+    1  870  180 1100   40  200  200  200  1
+    2  870  180 1320  180  200    0  inf  5
+    1 -760  240  380  180  190  190  250  3
+    1 -760  240  650   90  230    0  280  5
+    1 -800 -350  280   80   90   90   90  1
+    2 -800 -350  480  120   70   40  inf  6
+    3 -800 -350  640   55   55   55  inf  6
+""".split(), float).reshape(-1, 9) / (1, *[1000] * 7, 1)
 LANDMARK[2:8, 1] = np.linspace(-.54, .60, 6)   # the columns stand in a row
 GROUPS = (2, 16), (11, 16), (16, 19), (19, 21), (21, 24)   # on the plinth; of it the dome; ...
-HOUSES = table("""
+HOUSES = array("""
     -7.5 2.0 .6 1.5
     -6.2 4.4 .5 1.1
     -4.0 6.4 .8 1.8
@@ -233,7 +222,7 @@ HOUSES = table("""
      4.6 5.6 .5 1.9
      6.8 3.0 .6 1.3
      7.4 0.0 .5 1.7
-""")   # x, y, half width, height
+""".split(), float).reshape(-1, 4)   # x, y, half width, height
 
 
 def town():
@@ -270,21 +259,19 @@ def toy_parts(landmark, background):
 
 def part_sdf(part, x):
     """Distance to one part (9,), or to one part for each point (P,9). x (P,3) -> (P,)"""
-    p = x - part[..., 1:4]
-    shape, half, bottom, top, depth = part.T[[0, 4, 5, 6, 7]]
-    z = p[:, 2]
-    u = where(shape == 1, abs(p[:, 0]), hypot(p[:, 0], p[:, 1]))
+    shape, _, _, _, half, bottom, top, depth, _ = part.T
+    x, y, z = (x - part[..., 1:4]).T
+    u = where(shape == 1, abs(x), hypot(x, y))
     # In the plane of u and z: the slanted side from bottom to top, and the caps.
     grow = top - bottom
     tall = 2 * half
     k = ((u - bottom) * grow + (z + half) * tall) / (grow ** 2 + tall ** 2)
     k = clip(k, 0, 1)
     side = hypot(u - bottom - k * grow, z + half - k * tall)
-    width = where(z < 0, bottom, top)
-    cap = hypot(maximum(u - width, 0), abs(z) - half)
+    cap = hypot(maximum(u - where(z < 0, bottom, top), 0), abs(z) - half)
     inside = (abs(z) < half) & (u < bottom + grow * (z + half) / tall)
     d = where(inside, -1, 1) * minimum(side, cap)
-    e = abs(p[:, 1]) - depth   # -inf for a column
+    e = abs(y) - depth   # -inf for a column
     d = hypot(maximum(d, 0), maximum(e, 0)) + minimum(maximum(d, e), 0)
     return where(shape == 3, hypot(u, z) - bottom, d)
 
@@ -357,20 +344,20 @@ def sky(d):
 
 def paint(x, part, is_ground):
     """Solid texture of cells at points of the surface: x (H,3), part (H,9) -> (H,3)"""
-    square = where(hypot(x[:, 0], x[:, 1]) < 2.6, PAVING, MEADOW)
+    x, y, z = x.T
+    shape, centre_x, centre_y = part.T[:3]
+    square = where(hypot(x, y) < 2.6, PAVING, MEADOW)
     look = LOOKS[where(is_ground, square, part[:, 8]).astype(int)]
-    colour, width, height, contrast, windows = np.split(look, [3, 4, 5, 6], axis=1)
-    turn = np.arctan2(x[:, 1] - part[:, 2], x[:, 0] - part[:, 1])
-    across = where(part[:, 0] == 1, x[:, 0] + x[:, 1], turn)
-    across = where(is_ground, x[:, 0], across)
-    row = where(is_ground, x[:, 1], x[:, 2])[:, None] / height
+    width, height, contrast, windows = look.T[3:]
+    turn = np.arctan2(y - centre_y, x - centre_x)
+    across = where(is_ground, x, where(shape == 1, x + y, turn))
+    row = where(is_ground, y, z) / height
     bond = (np.floor(row) % 2 / 2) * (1 - windows)   # every other row of stones is shifted
-    column = across[:, None] / width + bond
-    seed = 12.9898 * np.floor(column) + 78.233 * np.floor(row)
-    chance = abs(np.sin(seed)) * 437.585 % 1
+    column = across / width + bond
+    chance = abs(np.sin(12.9898 * np.floor(column) + 78.233 * np.floor(row))) * 437.585 % 1
     is_window = (abs(column % 1 - .5) < .2) * (abs(row % 1 - .45) < .28)
-    dark = windows * is_window
-    return colour * ((1 + contrast * (2 * chance - 1)) * (1 - .8 * dark))
+    brightness = (1 + contrast * (2 * chance - 1)) * (1 - .8 * (windows * is_window))
+    return look[:, :3] * brightness[:, None]
 
 
 def shade(o, d, parts, background, sun):
@@ -612,27 +599,26 @@ def statistics(scene):
     points in the sphere; exposure_spread, deviation of brightness (0..1) at equal points; bg_color
     (3,), beyond the sphere; NaN unless 60 % agree."""
     K, c2w, wh, rgb = scene["K"], scene["c2w"], scene["wh"], scene["rgb"]
-    points = scene["points"].astype(float)
+    start = scene["start"]
     ends = np.searchsorted(scene["track_photo"], np.arange(1, len(wh)))
     tracks = np.split(scene["track_point"], ends)
     step = max(1, len(rgb) // 500_000)
     near, places = [], []   # of all photos
     seen, size, bright, beyond = [], [], [], []   # of the training photos
     for i, own in enumerate(tracks):
-        uv, distance = project(K[i], c2w[i], points[own])
+        uv, distance = project(K[i], c2w[i], scene["points"][own].astype(float))
         places.append(clip(uv / wh[i], -1, 2))
         near.append(max(0.8 * quantile(distance, 0.02), 0.02) if len(own) else 0.05)
         if scene["is_test"][i]:
             continue
-        photo = rgb[scene["start"][i]:scene["start"][i + 1]]
         u, v = clip(uv, 0, wh[i] - 1).astype(int).T
         seen.append(own)
         size.append(distance / K[i, 0])
-        bright.append(photo[v * wh[i, 0] + u].mean(1) / 255)
+        bright.append(rgb[start[i] + v * wh[i, 0] + u].mean(1) / 255)
         o, d = c2w[i, :, 3], rays(K[i], c2w[i], *wh[i])
         closest = o - minimum(d @ o, 0)[:, None] * d   # to the centre, along each ray
         misses = norm(closest, axis=1) > 1
-        beyond.append(photo[misses][::step])
+        beyond.append(rgb[start[i]:start[i + 1]][misses][::step])
     every, size, beyond = concatenate(seen), concatenate(size), concatenate(beyond)
     mean = np.bincount(every, concatenate(bright)) / maximum(np.bincount(every), 1)   # (K,)
     offsets = [median(b - mean[own]) for b, own in zip(bright, seen) if len(own)]
@@ -640,19 +626,13 @@ def statistics(scene):
     if len(beyond) > 100:   # fewer may all be people
         usual = median(beyond, 0)
         agree = (abs(beyond - usual) < 5.1).all(1)
-        if agree.sum() > 0.6 * len(beyond):
+        if agree.mean() > 0.6:
             color = usual / 255
     inside = norm(scene["points"][every], axis=1) < 1
-    if inside.any():
-        size = size[inside]
-    else:
-        size = norm(c2w[:, :, 3], axis=1) / K[:, 0]
-    scene["near"] = np.float32(near)
-    scene["track_uv"] = concatenate(places, dtype=np.float32)
-    scene["footprint"] = quantile(size, 0.25)
-    scene["exposure_spread"] = np.std(offsets)
-    scene["bg_color"] = color
-    return scene
+    size = size[inside] if inside.any() else norm(c2w[:, :, 3], axis=1) / K[:, 0]
+    added = dict(near=np.float32(near), track_uv=concatenate(places, dtype=np.float32))
+    added.update(footprint=quantile(size, 0.25), exposure_spread=np.std(offsets), bg_color=color)
+    return scene | added
 
 
 # ---- folders with photos and COLMAP models -------------------------------------------------------
@@ -665,13 +645,12 @@ FOCAL_LENGTHS = {0: 1, 1: 2, 2: 1, 3: 1, 4: 2, 6: 2}   # not of fisheye and othe
 
 @dataclass
 class Photo:
-    """A photo as a model has it, in SfM units; what it lacks is None if it has a fault."""
-    fault: str = ""   # a sentence about the photo: why it cannot be used
-    wh: tuple = ()
-    K: np.ndarray = None   # (4,)
-    bend: np.ndarray = None   # k1 k2 p1 p2 k3 .. k6 of OpenCV
-    c2w: np.ndarray = None   # (3,4)
-    points: list = ()   # ids, then rows, of the points that it observes
+    """A photo as a model has it, in SfM units."""
+    wh: tuple
+    K: np.ndarray   # (4,)
+    bend: np.ndarray   # k1 k2 p1 p2 k3 .. k6 of OpenCV
+    c2w: np.ndarray   # (3,4)
+    points: list   # ids, then rows, of the points that it observes
 
 
 def open_binary(path):
@@ -687,57 +666,53 @@ def open_binary(path):
     return read
 
 
-def read_cameras(sparse):
-    """{id: Photo without pose}"""
-    cameras = {}
-    read = open_binary(sparse / "cameras.bin")
-    undistort = f"run colmap image_undistorter with --input_path {sparse}"
-    for _ in range(*read("Q")):
-        key, model, w, h = read("IiQQ")
-        is_known = 0 <= model < len(PARAMETERS)
-        check(is_known, f"{sparse} has camera model {model}, which is unknown: {undistort}")
-        numbers = array(read(f"{PARAMETERS[model]}d"))
-        n = FOCAL_LENGTHS.get(model)
-        if n is None:
-            cameras[key] = Photo(f"has a fisheye or other camera of model {model}: {undistort}")
-            continue
-        is_sound = (abs(numbers) < FAR).all() and min(numbers[:n]) > 1 / FAR   # false for nan
-        if not is_sound or not (0 < w < 32767 and 0 < h < 32767):
-            fault = f"has camera {key} of {w} x {h} with {numbers.tolist()}, which cannot be"
-            cameras[key] = Photo(f"{fault}: export the model again")
-            continue
-        bend = np.zeros(8)
-        bend[:len(numbers) - n - 2] = numbers[n + 2:]
-        K = numbers[[0, n - 1, n, n + 1]]
-        cameras[key] = Photo(wh=(w, h), K=K, bend=bend)
-    return cameras
+def make_photo(camera, pose, ids):
+    """Photo; UserError, a sentence about it, if it cannot be used."""
+    check(camera, "has no camera in the model: export the model again")
+    model, *wh, numbers = camera
+    check(model in FOCAL_LENGTHS, f"has a fisheye or other camera, COLMAP's model {model}: run "
+          "colmap image_undistorter")
+    n = FOCAL_LENGTHS[model]
+    is_sound = (abs(numbers) < FAR).all() and min(numbers[:n]) > 1 / FAR and 0 < min(wh)
+    check(is_sound and max(wh) < 32767, f"has a camera of {wh[0]} x {wh[1]} with {numbers.tolist()}"
+          ", which cannot be: export the model again")
+    is_sound = all(abs(value) < FAR for value in pose) and any(pose[:4])   # false for nan
+    check(is_sound, "has no sound pose: run SfM again")
+    bend = np.zeros(8)
+    bend[:len(numbers) - n - 2] = numbers[n + 2:]
+    w, *v = array(pose[:4]) / math.hypot(*pose[:4])   # old files are not normalised
+    cross = np.cross(v, np.eye(3))
+    R = np.eye(3) + 2 * w * cross + 2 * cross @ cross   # camera to world
+    c2w = np.column_stack([R, -R @ pose[4:]])
+    return Photo(tuple(wh), numbers[[0, n - 1, n, n + 1]], bend, c2w, ids)
 
 
 def read_photos(sparse):
-    """{name: Photo} of a COLMAP model, SfM units."""
-    cameras = read_cameras(sparse)
+    """{name: Photo} of a COLMAP model, and {name: fault} of those that cannot be used."""
+    cameras = {}
     photos = {}
+    faults = {}
+    read = open_binary(sparse / "cameras.bin")
+    for _ in range(*read("Q")):
+        key, model, w, h = read("IiQQ")
+        check(0 <= model < len(PARAMETERS), f"{sparse} has camera model {model}, which is unknown: "
+              "run colmap image_undistorter")
+        cameras[key] = model, w, h, array(read(f"{PARAMETERS[model]}d"))
     read = open_binary(sparse / "images.bin")
     for _ in range(*read("Q")):
         _, *pose, camera = read("I7dI")
         name = b"".join(iter(lambda: read(1), b"\0")).decode(errors="replace")
         (count,) = read("Q")
-        ids = np.frombuffer(read(24 * count), "<u8")[2::3]   # of u, v, point
+        ids = np.frombuffer(read(24 * count), "<u8")[2::3].tolist()   # of u, v, point
         is_inside = name and name[0] != "/" and "\\" not in name and ".." not in name.split("/")
         check(is_inside, f"{sparse}: photo {name!r} is outside the image folder: rename it")
-        check(name not in photos, f"{sparse}: photo {name!r} occurs twice: export the model again")
-        photo = cameras.get(camera, Photo("has no camera in the model: export it again"))
-        is_sound = all(abs(value) < FAR for value in pose) and any(pose[:4])   # false for nan
-        if not is_sound:
-            photo = Photo("has no sound pose: run SfM again")
-        if not photo.fault:
-            w, *v = array(pose[:4]) / math.hypot(*pose[:4])   # old files are not normalised
-            cross = np.cross(v, np.eye(3))
-            R = np.eye(3) + 2 * w * cross + 2 * cross @ cross   # camera to world
-            c2w = np.column_stack([R, -R @ pose[4:]])
-            photo = replace(photo, c2w=c2w, points=ids.tolist())
-        photos[name] = photo
-    return photos
+        is_new = name not in photos and name not in faults
+        check(is_new, f"{sparse}: photo {name!r} occurs twice: export the model again")
+        try:
+            photos[name] = make_photo(cameras.get(camera), pose, ids)
+        except UserError as e:
+            faults[name] = str(e)
+    return photos, faults
 
 
 def read_points(sparse):
@@ -769,8 +744,8 @@ def share_in_photo(points, photos):
         ok = ((place >= 0) & (place <= 1)).all(1)
         if ok.sum() > 20 and np.ptp(place[ok], axis=0).max() < .02:
             ok[:] = False   # all at one place: points in smaller units than the poses
-        inside.append(ok)
-    return concatenate(inside).mean()
+        inside.extend(ok)
+    return np.mean(inside)
 
 
 def photo_files(folder):
@@ -801,30 +776,20 @@ def model_folders(folder, name="images.bin"):
     return sorted(found, key=lambda place: (len(place.parts), place))
 
 
-@dataclass
-class Model:
-    sparse: Path
-    photos: dict   # {name: Photo}
-    images: Path   # that folder of photos around it in which most of its photos are
-    files: dict   # {name: path} of all photos there
-
-    def __post_init__(self):
-        self.names = sorted(self.photos.keys() & self.files.keys())
-
-
 def open_model(folder, sparse):
-    photos = read_photos(sparse)
+    """A model with that folder of photos around it in which most of its photos are."""
+    photos, faults = read_photos(sparse)
+    known = photos.keys() | faults.keys()
     around = [sparse, *sparse.parents]
     around = around[:around.index(folder) + 1]
     places = [place / name for place in around for name in ("images", "input", "")]
-    models = [Model(sparse, photos, place, photo_files(place)) for place in places]
-    return max(models, key=lambda model: len(model.names))
-
-
-def rank(model):
-    """Usable photos, and those of them without distortion."""
-    usable = [model.photos[name] for name in model.names if not model.photos[name].fault]
-    return len(usable), sum(not photo.bend.any() for photo in usable)
+    images = max(places, key=lambda place: len(known & photo_files(place).keys()))
+    files = photo_files(images)
+    names = sorted(known & files.keys())   # posed, and on disk
+    straight = [name for name in names if name in photos and not photos[name].bend.any()]
+    rank = len(photos.keys() & files.keys()), len(straight)
+    return SimpleNamespace(sparse=sparse, photos=photos, faults=faults, known=known, images=images,
+                           files=files, names=names, rank=rank)
 
 
 def find_model(folder, command):
@@ -835,25 +800,22 @@ def find_model(folder, command):
           f"--output_type BIN with input and output path {' or '.join(map(str, texts))}")
     check(places, f"{folder} has no COLMAP model; run: python data_prep.py {command}")
     models = [open_model(folder, place) for place in places]
-    best = max(models, key=rank)
-    hint = renamed(best.photos, photo_files(folder))
-    check(best.names, f"no photo of {best.sparse} is on disk{hint}: put them into "
-          f"{folder / 'images'}, or run: python data_prep.py {command}")
+    best = max(models, key=lambda model: model.rank)
+    hint = renamed(best.known, photo_files(folder))
+    check(best.names, f"no photo of {best.sparse} is on disk{hint}: put them into {folder}/images, "
+          f"or run: python data_prep.py {command}")
     on_disk = max(len(model.files) for model in models if model.names)
     print(f"{best.images}: {on_disk} photos on disk, {len(best.names)} posed by {best.sparse}")
-    others = [model for model in models if model.photos.keys() != best.photos.keys()]
-    if others:
-        counts = [f"{len(model.photos)} by {model.sparse}" for model in others]
-        print(f"other models are left out: {', '.join(counts)} photos")
+    for model in models:
+        if model.known != best.known:
+            print(f"left out is another model: {len(model.known)} posed by {model.sparse}")
     return best
 
 
 def read_table(path):
     """Lines of a table of any separator, as lists of words."""
-    data = path.read_bytes()
-    is_wide = data[:2] in (b"\xff\xfe", b"\xfe\xff")
-    lines = data.decode("utf-16" if is_wide else "utf-8-sig", "replace").splitlines()
-    lines = [line for line in lines if line.strip()] or [""]
+    text = path.read_bytes().decode("utf-8-sig", "replace")
+    lines = [line for line in text.splitlines() if line.strip()] or [""]
     mark = max("\t;,", key=lines[0].count)
     return [[word.strip(' "') for word in line.split(mark)] for line in lines]
 
@@ -883,26 +845,21 @@ def read_split(path):
 
 
 def find_split(folder):
-    """The split file of a folder, or one of its two lists."""
-    for kind in "*.tsv", "*.csv", "train*.txt":
-        tables = [path for path in sorted(folder.glob(kind)) if path.name[0] != "."]
-        if kind == "*.csv":   # people keep other tables too
-            tables = [path for path in tables if "filename" in read_table(path)[0]]
-        names = ", ".join(table.name for table in tables)
-        check(len(tables) < 2, f"{folder} has several split files ({names}): choose by --split")
-        if tables:
-            return tables[0]
+    """The split file of a folder, or one of its two lists, or None."""
+    tables = sorted([*folder.glob("[!.]*.tsv"), *folder.glob("[!.]*.csv")])   # or of other things:
+    tables = [path for path in tables if path.suffix == ".tsv" or "split" in read_table(path)[0]]
+    tables = tables or list(folder.glob("train*.txt"))
+    names = ", ".join(table.name for table in tables)
+    check(len(tables) < 2, f"{folder} has several split files ({names}): choose by --split")
+    return tables[0] if tables else None
 
 
 def fingerprint(folder, images, split):
     """Of names, sizes and times of all files that a scene is read from."""
-    paths = list(photo_files(images).values())
-    for pattern in "*.tsv", "*.csv", "t*.txt":
-        paths += folder.glob(pattern)
+    paths = [*photo_files(images).values(), *folder.glob("*.?sv"), *folder.glob("t*.txt")]
     for place in model_folders(folder):
         paths += place.glob("*.bin")
-    if split:
-        paths.append(Path(split))
+    paths += [Path(split)] if split else []
     stats = [(path, path.stat()) for path in sorted(paths) if path.exists()]
     lines = [f"{path} {stat.st_size} {stat.st_mtime_ns}" for path, stat in stats]
     return zlib.crc32(os.fsencode("\n".join(lines)))
@@ -928,7 +885,6 @@ def decode(path):
 
 def read_photo(path, photo, downscale):
     """Undistorted, then reduced. -> rgb uint8 (h,w,3), K (4,)"""
-    check(not photo.fault, photo.fault)
     w, h = photo.wh
     K = photo.K
     check(downscale <= min(w, h) / 2, f"is {w} x {h}: --downscale {downscale} leaves nothing of it")
@@ -956,13 +912,13 @@ def choose_parts(folder, model, split):
         return {n: "test" if i % 8 == 7 else "train" for i, n in enumerate(model.names)}
     parts = read_split(table)
     print(f"split by {table}")
-    lost = sorted(parts.keys() - set(model.names))
+    lost = parts.keys() - set(model.names)
     if lost:
         hint = renamed(lost, model.names)
-        warn(f"{len(lost)} photos of {table} have no pose or no file{hint}: {lost[0]} ...")
-    rest = sorted(set(model.names) - parts.keys())
+        warn(f"{len(lost)} photos of {table} have no pose or no file{hint}: {min(lost)} ...")
+    rest = set(model.names) - parts.keys()
     if rest:
-        warn(f"{len(rest)} photos are not in {table}: {', '.join(rest[:3])} ...")
+        warn(f"{len(rest)} photos are not in {table}: {min(rest)} ...")
     return parts
 
 
@@ -973,41 +929,40 @@ def read_usable(model, parts, downscale):
     for name in progress(sorted(parts), "preparing photos"):
         try:
             check(name in model.names, "has no pose or no file")
+            check(name in model.photos, model.faults.get(name))
             photo = model.photos[name]
-            image, K = read_photo(model.files[name], photo, downscale)
             angle = 2 * np.degrees(np.arctan(max(photo.wh / photo.K[:2]) / 2))
             is_usual = parts[name] == "test" or 10 <= angle <= 120
             check(is_usual, f"is {angle:.1f} degrees wide, which is not in 10..120")
-            usable[name] = image, K
+            usable[name] = read_photo(model.files[name], photo, downscale)
         except UserError as e:
             faults[name] = f"{name} {e}"
             warn(f"left out: {name} {e}")
-    lost = "; ".join(fault for name, fault in faults.items() if parts[name] == "test")
+    lost = "; ".join(faults[name] for name in faults if parts[name] == "test")
     check(not lost, f"held-out photos cannot be used: {lost}; mend them, or hold out others")
     count = sum(parts[name] == "train" for name in usable)
-    first = min(faults.values(), default="")
-    check(count >= 2, f"{count} usable training photos are too few; mend split file or photos: {first}")
+    first = min(faults.values(), default="mend the split file")
+    check(count >= 2, f"{count} usable training photos are too few: {first}")
     return usable
 
 
 def prepare(name, downscale=2, split=None):
     """Scene of one of SCENES, or of a folder with photos and a COLMAP model; see FORMAT."""
     check(downscale >= 1, f"--downscale {downscale} is not 1 or more")
-    folder = Path(name)
-    command = f"{name} --sfm"
+    folder, command = Path(name), f"{name} --sfm"
     if name in SCENES:
-        homes = [Path("data", home) for home in (name, SCENES[name][0])]
-        folder = homes[0] if homes[0].is_dir() else homes[1]
-        command = f"{name} --download"
+        folder, command = Path("data", name), f"{name} --download"
+        if not folder.is_dir():
+            folder = Path("data", SCENES[name][0])
     model = find_model(folder, command)
     files = fingerprint(folder, model.images, split)
     parts = choose_parts(folder, model, split)
     points, rows = read_points(model.sparse)
     choose_points(points)   # fails before photos are read
-    sound = [photo for photo in model.photos.values() if not photo.fault]
-    for photo in sound:
+    photos = model.photos
+    for photo in photos.values():
         photo.points = array([rows[key] for key in photo.points if key in rows], int)
-    share = share_in_photo(points, sound) if sound else 1
+    share = share_in_photo(points, photos.values()) if photos else 1
     says = f"{share:.0%} of the sightings of {model.sparse} fall into the photo that saw them"
     check(share >= .5, f"only {says}: give poses as COLMAP does, world to camera, x right, y down, "
           "z forward, in the units of the points")
@@ -1016,12 +971,13 @@ def prepare(name, downscale=2, split=None):
     usable = read_usable(model, parts, downscale)
     images, K = zip(*usable.values())
     is_test = array([parts[name] == "test" for name in usable])
-    used = [model.photos[name] for name in usable]
-    info = dict(scene=folder.resolve().name, kind="colmap", downscale=downscale,
-                folder=str(folder), split=split and str(Path(split).resolve()),
-                images=str(model.images), files=files)
-    scene = finish(images, K, [photo.c2w for photo in used], is_test, list(usable), points,
-                   [photo.points for photo in used], info)
+    c2w = [photos[name].c2w for name in usable]
+    tracks = [photos[name].points for name in usable]
+    info = dict(scene=folder.resolve().name, kind="colmap", downscale=downscale, files=files,
+                folder=str(folder), images=str(model.images), split=None)
+    if split:
+        info["split"] = str(Path(split).resolve())
+    scene = finish(images, K, c2w, is_test, list(usable), points, tracks, info)
     inside = (norm(scene["points"], axis=1) < 1).mean()
     print(f"the sphere has a radius of {scene['scale']:.3g} units of the reconstruction; "
           f"{inside:.0%} of the points are inside")
@@ -1037,15 +993,6 @@ def scene_path(name_or_folder):
     return Path("data", f"{folder.name}{mark}.npz")
 
 
-def is_fresh(info):
-    """Whether the sources are what they were; a scene file also does without them."""
-    folder = Path(info["folder"])
-    if not folder.is_dir():
-        return True
-    images = Path(info.get("images", ""))
-    return info.get("files") == fingerprint(folder, images, info["split"])
-
-
 def open_scene(name_or_folder, downscale=2):
     """Scene from its file: made on first use, and anew if its sources differ in any way."""
     path = scene_path(name_or_folder)
@@ -1055,8 +1002,11 @@ def open_scene(name_or_folder, downscale=2):
         scene = read_scene(path)
         info = json.loads(str(scene["info"]))
         split = info["split"]   # named once, by --split
-        if is_toy or (info["downscale"] == downscale and is_fresh(info)):
-            return scene
+        folder, images = Path(info["folder"] or ""), Path(info.get("images", ""))
+        is_alone = is_toy or not folder.is_dir()   # a scene file does without its sources
+        if is_alone or info.get("files") == fingerprint(folder, images, split):
+            if is_toy or info["downscale"] == downscale:
+                return scene
     print(f"making {path}")
     scene = make_toy() if is_toy else prepare(name_or_folder, downscale, split)
     write_scene(path, scene)
