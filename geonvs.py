@@ -1584,6 +1584,7 @@ def write_panel(path, model, frames, width=240):
         tiles = {title: frame["truth"], "render": frame["rgb"]}
         if isinstance(model, GeoNVS):
             tiles["normals"] = frame["normal"] / 2 + 0.5
+        if isinstance(model, GeoNVS) and model.cfg.mask != "off":
             M = model.mask.logits([photo]).detach().sigmoid()  # (1,1,m,m)
             colors = cv2.applyColorMap(to_uint8(M[0, 0].cpu()), cv2.COLORMAP_VIRIDIS)
             tiles["mask: yellow is transient"] = colors[:, :, ::-1] / 255
