@@ -16,29 +16,32 @@ Conventions
   rays      r(t) = o + t d with |d| = 1, so t is a distance along the ray and not a z-depth
   sdf       positive outside; the normal is the unit gradient; colours are sRGB in [0, 1]
   mask      M = 1 means transient (person, car), M = 0 means scene
+  symbols   s signed distance, zeta sharpness of walls (1 / zeta is their width), eps length of the
+            taps of finite differences, lap the Laplacian, E_grad = (|grad s| - 1)^2, Phi edges
   shapes    R rays, S sections of a ray (S + 1 samples), P points, N cells, L octree levels, C
             channels per level, V rows of features, H hidden width, G what colour is read from,
             A appearance dims, B photos of all I, K SfM points, T sightings of them
 
 Where the printed paper is departed from, the line carries its tag:
   [D1]  alpha is divided by sigmoid(zeta s_i) and never negative (printed: a wall is 63 % opaque)
-  [D2]  no beta in alpha: s is evaluated at both ends of a section, so no slope has to be guessed
-  [D3]  Phi: E_grad and |lap| eps where the ray ends, a sigmoid set by quantiles of rays on the
-        foreground, times opacity, without gradient
+  [D2]  alpha has no beta: s is evaluated at both ends of a section, so no slope has to be guessed
+  [D3]  Phi is a sigmoid of 10 E_grad + 2 |lap| eps opacity at the ray's end, set by quantiles of
+        rays that end on the foreground, times opacity; it has no gradient
   [D4]  the curvature loss is |lap| eps opacity, since |lap| of a trilinear field grows as eps
         shrinks; its weight is 0.01 (printed: lambda_curv = 2 stands in Eq. 4 and in Eq. 5)
   [D5]  the Lipschitz term is a sum of logs, not a product that can drown the colour at first
-  [D6]  a small CGNet on small square photos: one plain block a stage, GroupNorm, ReLU, finer head
-  [D7]  M is taught as a classification: transient where a ray's error exceeds its price, which
-        is what SfM pixels err by, plus lam_mask, plus lam_gpl Phi; no term for bimodality; only
-        in the first 60 % of training
+  [D6]  CGNet is small and sees small square photos: one plain block a stage, GroupNorm, ReLU
+  [D7]  M is learnt by classification. A ray is transient if its error exceeds its price, which is
+        max(upper quartile of errors at SfM pixels + lam_mask, 0.15) + lam_gpl Phi. There is no
+        term for bimodality. Lessons end after 60 % of training
   [D8]  the background also fills what lies before the sphere; its last section is opaque
-  [D9]  mixed precision for the colour and background networks alone: distances stay float32
+  [D9]  only the colour and background networks have mixed precision: distances stay float32
   [D10] SfM points place the sphere, seed the octree, teach M = 0 and pull s(p) to zero, but less
         while zeta is below 40: a strong pull would leave the surface fog
   [D11] samples are drawn from a cached SDF volume; no second network pass along the ray
-  [D12] test photos: appearance fitted on the left half, scored on the right half
-  [D13] derivatives by four taps around the ray's end and around one random sample of it
+  [D12] a test photo's code is fitted on its left half, its score is taken on the right half
+  [D13] derivatives are differences between four taps, around the ray's end and around one random
+        sample of it; all samples of a ray give the colour network the normal of the ray's end
   [D14] zeta stays above a rising floor, so that no surface stays fog, and below a fixed bound
   [D15] cells split where colours err and merge far from surfaces; a scene that needs no codes, no
         mask or no background field is modelled without
@@ -89,7 +92,7 @@ AT_LEAST = dict(
 
 @dataclass
 class Config:
-    """All settings. Of the weights and sizes the paper gives lam_gpl alone."""
+    """All settings. Of these defaults lam_gpl alone is the paper's."""
     scene: str = opt("toy", "synthetic, or of Phototourism", "toy", *data_prep.SCENES)
     data: str = opt("", "an IMC-PT or COLMAP folder instead of a named scene")
     name: str = opt("", "run folder below runs/ (default: scene-method-seed)")
@@ -100,7 +103,7 @@ class Config:
     downscale: int = opt(2, "integer factor by which photos are made smaller (benchmarks use 2)")
     rays: int = opt(512, "rays per step, of all processes together")
     photos: int = opt(8, "photos per step, of each process; the mask network sees them whole")
-    samples: int = opt(15, "sections of a ray in the foreground")
+    samples: int = opt(15, "sections S of a ray in the foreground, S + 1 samples")
     bg_samples: int = opt(24, "background samples per ray, a sixth of them before the sphere")
     levels: int = opt(0, "octree levels, 0: from the pixel footprint at the surface", *range(9))
     hidden: int = opt(64, "width of the MLPs")
@@ -132,7 +135,7 @@ class Config:
 
     @property
     def source(self):
-        """What data_prep.open_scene takes: a scene's name, or a folder, never mistaken for one."""
+        """What data_prep.open_scene takes: a scene's name, or an absolute path."""
         if self.data:
             return str(Path(self.data).resolve())
         return self.scene
@@ -264,8 +267,9 @@ def corner_weights(f):
 
 
 class WeightedSum(torch.autograd.Function):
-    """Row p of the result: the sum over 8 corners k of w[p,k] table[row[p,k]]. A step's hottest
-    operation; autograd's own backward takes several times as long."""
+    """Row p of the result: the sum over 8 corners k of w[p,k] table[row[p,k]]. Only the table gets
+    a gradient, as derivatives in x are finite differences [D13]. A step's hottest operation;
+    autograd's own backward takes several times as long."""
     @staticmethod
     def forward(ctx, table, row, w):  # (V,C), (P,8), (P,8) -> (P,C)
         ctx.save_for_backward(row, w)
@@ -296,7 +300,8 @@ class Octree(nn.Module):
     """Feature grid over the cube [-half, half]^3 that is fine only where it has been split. Level
     0 is a dense grid of root^3 cells. Features live on corners, shared by the cells that meet
     there. A corner that lacks one of its cells ("hanging") has the weight 0, so the field is
-    continuous across borders of refined regions; so has a level that a place lacks."""
+    continuous across borders of refined regions. At a place where a level has no cell, the
+    features of that level are 0."""
     def __init__(self, half, levels, channels=4, root=16):
         super().__init__()
         self.half = half
@@ -307,7 +312,7 @@ class Octree(nn.Module):
         self.row_stride = constant(root**2, root, 1)
         self.octant_stride = constant(4, 2, 1)
         self.resolution = nn.Buffer(root * 2.0 ** torch.arange(levels), persistent=False)  # (L,)
-        self.build(self.corner_key)
+        self.build(self.corner_key)  # no cell has the key -1: none is split
 
     def side(self, level):
         """Side of a cell, scene units. level: a number, or a tensor of them."""
@@ -346,7 +351,7 @@ class Octree(nn.Module):
         is_split = torch.cat(splits)
         first = self.root**3 + 8 * (is_split.cumsum(0) - 1)  # (N,) children follow each other
         self.child = torch.where(is_split, first, 0).int()  # (N,) 0: none
-        self.ends = nn.Buffer(torch.zeros(len(first), 3, device=first.device))  # see record
+        self.ends = nn.Buffer(torch.zeros(len(first), 3, device=first.device))  # (N,3) by record
 
         corners = self.cells[:, None] + F.pad(octants, (1, 0))  # (N,8,4)
         key = self.key(corners)  # (N,8)
@@ -354,7 +359,7 @@ class Octree(nn.Module):
         last = self.root << self.cells[:, :1, None]  # (N,1,1) index on the cube's far faces
         index = corners[:, :, 1:]
         is_within = (index > 0) & (index < last)  # (N,8,3)
-        self.is_free = cells_around[number] == 2 ** is_within.sum(2)  # (N,8) not hanging
+        self.is_free = cells_around[number] == 2 ** is_within.sum(2)  # (N,8)
         old_key = self.corner_key
         self.corner_key = key[self.is_free].unique()  # (V,)
         self.corner = nearest_row(self.corner_key, key).int()  # (N,8) any row, where hanging
@@ -374,7 +379,7 @@ class Octree(nn.Module):
         octant = ((index & 1) * self.octant_stride).sum(2)  # (P,L)
         node = (index[:, 0] * self.row_stride).sum(1)  # (P,)
         nodes = [node]
-        exists = [node >= 0]
+        exists = [node >= 0]  # level 0 is everywhere
         for level in range(1, self.levels):
             child = self.child.index_select(0, node)  # (P,)
             exists.append(child > 0)
@@ -396,7 +401,8 @@ class Octree(nn.Module):
         return out.reshape(len(x), -1)
 
     def record(self, x, error, pixel, weight):
-        """Adds to the cells where rays end, at x (P,3): error, size of a pixel and weight (P,)."""
+        """Adds to the columns of the cells in which rays end, at x (P,3): error, size of a pixel
+        there, both times weight (P,), and weight."""
         node, _, _ = self.locate(x)
         columns = torch.stack([error, pixel, torch.ones_like(error)], 1)  # (P,3)
         self.ends.index_add_(0, node[:, -1], weight[:, None] * columns)
@@ -449,7 +455,7 @@ def refined_keys(octree, sdf, zeta):
     is_split = octree.child > 0
     error, pixel, count = octree.ends.unbind(1)  # (N,) sums
     is_open = (s < reach) & ~is_split & (level < octree.levels - 1)
-    is_coarse = pixel < count * side / 2
+    is_coarse = pixel < count * side / 2  # mean size of a pixel under a child's side
     error = error * (is_open & is_coarse)
     worst = error.argsort(descending=True)  # (N,)
     before = error[worst].cumsum(0) - error[worst]  # (N,) what worse cells hold
@@ -482,19 +488,19 @@ def mlp(inputs, hidden, outputs):
         nn.Linear(hidden, outputs))
 
 
-A = 3**-0.5
+UNIT = 3**-0.5
 TAPS = (  # a point and, at a distance of 1, the ends of a tetrahedron
     (0.0, 0.0, 0.0),
-    (A, A, A),
-    (A, -A, -A),
-    (-A, A, -A),
-    (-A, -A, A))
+    (UNIT, UNIT, UNIT),
+    (UNIT, -UNIT, -UNIT),
+    (-UNIT, UNIT, -UNIT),
+    (-UNIT, -UNIT, UNIT))
 
 
 def finite_differences(s, taps, eps):
     """Gradient (P,3) and Laplacian (P,) of a field from its values s (P,5) at x + eps taps: x
     itself, then the ends of a regular tetrahedron (Neuralangelo uses six ends). [D13]"""
-    grad = 3 / (4 * eps) * (s @ taps)  # (P,3) as the sum of k k^T over the ends is 4/3
+    grad = 3 / (4 * eps) * (s @ taps)  # (P,3) as the sum of k k^T over the ends k is 4/3 I
     mean = s[:, 1:].mean(1)
     lap = 6 / eps**2 * (mean - s[:, 0])
     return grad, lap
@@ -562,9 +568,9 @@ class Deviation(nn.Module):
 
     @torch.no_grad()
     def bound(self, done, most):
-        """Keeps zeta above a floor, which rises from 15 to 80 in the first 43 % of training (done:
-        0..1), as in a crowd fog hides people from the mask, and people that it misses keep up the
-        fog. And below `most`: shards that hardly a sample meets would stay. [D14]"""
+        """Clamps zeta. The floor rises from 15 to 80 in the first 43 % of training (done: 0..1):
+        soft walls hide people from the mask, and people in the picture keep walls soft. Above
+        `most` a wall is thinner than the gap between samples; no gradient could move it. [D14]"""
         floor = 15 + 65 * min(done / 0.43, 1.0)
         self.v.clamp_(math.log(floor) / 10, math.log(most) / 10)
 
@@ -659,17 +665,18 @@ class Background(nn.Module):
         self.color = mlp(GEO + per_ray, hidden, 3)
 
     def forward(self, rays, t0, t1, per_ray, jitter):
-        """Colour (R,3) of what lies before t0 (R,1); the share (R,1) of light that passes it; that
-        share of the colour (R,3) beyond t1 (R,1). per_ray: (R,9+A) direction and code; jitter
-        (R,S) in 0..1. A sixth of the S samples lies before the sphere, evenly; the others are
-        even in u, at a distance u / (1 - u) behind it. The last is opaque. [D8]"""
+        """Returns front (R,3), the colour before t0 (R,1); passes (R,1), the light that front lets
+        through; behind (R,3), the colour beyond t1 (R,1), dimmed by front. per_ray: (R,9+A)
+        direction and code; jitter (R,S) in 0..1, here S background samples. A sixth of them lies
+        evenly before the sphere; the others are even in u, at a distance u / (1 - u) behind it.
+        The last is opaque. [D8]"""
         R, S = jitter.shape
         n = S // 6
         place = torch.arange(S, device=t0.device) + jitter  # (R,S)
         before = torch.lerp(rays.near, t0, place[:, :n] / n)  # (R,n)
         u = (place[:, n:] - n) / (S - n)  # (R,S-n)
         beyond = u / (1 - u).clamp(min=1e-3)
-        path = torch.cat([before, t0 + beyond], 1)  # (R,S) without the sphere's part
+        path = torch.cat([before, t0 + beyond], 1)  # (R,S) with the sphere cut out
         t = torch.cat([before, t1 + beyond], 1)  # (R,S)
         x = contract(rays.at(t)).flatten(0, 1)  # (RS,3)
         inputs = torch.cat([x, self.octree(x)], 1)  # (RS,3+LC)
@@ -696,10 +703,10 @@ def direction_code(d):
 
 
 def render_rays(model, rays, code, jitter):
-    """One ray batch through the whole model. code: (R,A) appearance; jitter in 0..1, for S - 1
-    samples of the foreground and for the background's. Returns rgb (R,3), opacity (R,); without
-    gradient depth (R,) and end (R,3), where the ray ends; there normal (R,3), e_grad, e_curv (R,);
-    distances t (R,S+1); is_inside (R,), whether the ray meets the sphere."""
+    """One ray batch through the whole model. code: (R,A) appearance; jitter in 0..1, S columns for
+    the foreground, of which the first is spare, then the background's. Returns rgb (R,3), opacity
+    (R,); without gradient depth (R,) and end (R,3), where the ray ends; there normal (R,3), e_grad,
+    e_curv (R,); distances t (R,S+1); is_inside (R,), whether the ray meets the sphere."""
     S = model.cfg.samples
     zeta = model.deviation()
     t0, t1 = sphere_interval(rays)  # (R,1)
@@ -710,9 +717,9 @@ def render_rays(model, rays, code, jitter):
     sdf, geo = model.sdf(x)  # (R(S+1),), (R(S+1),G)
     alpha = neus_alpha(sdf.reshape(t.shape), zeta)  # (R,S)
     w, trans = composite(alpha)  # (R,S), (R,)
-    near_end = F.pad(w, (0, 1))  # (R,S+1)
-    far_end = F.pad(w, (1, 0))
-    w = (far_end + near_end) / 2  # half of a section's weight to each of its ends
+    at_near_end = F.pad(w, (0, 1))  # (R,S+1)
+    at_far_end = F.pad(w, (1, 0))
+    w = (at_far_end + at_near_end) / 2  # (R,S+1) of samples: half of their two sections'
 
     depth = (w * t).sum(1) + trans * t1[:, 0]
     depth = depth.detach()  # (R,)
@@ -721,7 +728,7 @@ def render_rays(model, rays, code, jitter):
     normal = F.normalize(grad)
 
     per_ray = torch.cat([direction_code(rays.d), code], 1)  # (R,9+A)
-    constants = torch.cat([normal, per_ray], 1)  # (R,3+9+A) of all samples of a ray
+    constants = torch.cat([normal, per_ray], 1)  # (R,3+9+A) the same for all samples of a ray [D13]
     constants = constants.repeat_interleave(S + 1, 0)
     inputs = torch.cat([geo, constants], 1)  # (R(S+1),G+3+9+A)
     rgb = mixed_precision(model.color, inputs).sigmoid()
@@ -824,24 +831,25 @@ def gpl_loss(mask, phi):
 
 
 def transient_loss(logit, error, price):
-    """Teaches M = 1 to rays whose error (R,) exceeds their price (R,), M = 0 to the others: the
-    optimum of (1 - M) error + M price, with a slope where a sigmoid has none. [D7]"""
+    """Teaches M = 1 to rays whose error (R,) exceeds their price (R,), M = 0 to the others. The
+    same M minimises (1 - M) error + M price, but the slope of that vanishes where the sigmoid is
+    flat. [D7]"""
     is_transient = (error > price).float()
     weight = (error - price).abs()
     return F.binary_cross_entropy_with_logits(logit, is_transient, weight)
 
 
-def follow_quantiles(running, shares, values, is_meant, rate=0.1):
-    """Moves `running` (Q,), above 0, towards the quantiles `shares` (Q,) of those values (R,) that
-    are meant, by a factor: up where too many of them lie above it."""
-    is_below = (values[:, None] < running) & is_meant[:, None]  # (R,Q)
-    count = is_meant.sum()
-    excess = (count * shares - is_below.sum(0)) / count.clamp(min=1)  # (Q,) 0 if none is meant
+def follow_quantiles(running, shares, values, is_chosen, rate=0.1):
+    """Moves `running` (Q,), above 0, by a factor towards the quantiles `shares` (Q,) of the chosen
+    values (R,): up where too many of them lie above it."""
+    is_below = (values[:, None] < running) & is_chosen[:, None]  # (R,Q)
+    count = is_chosen.sum()
+    excess = (count * shares - is_below.sum(0)) / count.clamp(min=1)  # (Q,) 0 if none is chosen
     running *= torch.exp(rate * excess)
 
 
 LEAST_PRICE = 0.15  # error of a ray below which it is never transient
-TAUGHT = 0.6  # share of training in which the mask learns: a model that goes on paints people
+TAUGHT = 0.6  # share of training in which the mask learns; later it would give up people
 
 
 class TransientMask(nn.Module):
@@ -851,8 +859,8 @@ class TransientMask(nn.Module):
         self.cgnet = CGNet()
         self.thumbs = nn.Buffer(scene.thumbs, persistent=False)
         self.shares = constant(0.5, 0.75, 0.95)
-        self.complexity = nn.Buffer(torch.tensor([0.5, 1.0, 4.0]))  # of the foreground
-        self.sfm_error = nn.Buffer(torch.tensor([0.3]))  # upper quartile of rays at SfM points
+        self.complexity = nn.Buffer(torch.tensor([0.5, 1.0, 4.0]))  # (3,) of foreground rays
+        self.sfm_error = nn.Buffer(torch.tensor([0.3]))  # (1,) upper quartile at SfM pixels
         # which pixels of small photos show SfM points; some wrongly, at outlines [D10]
         n = scene.thumbs.shape[3] // 2
         static = torch.zeros(len(scene.thumbs), n, n, dtype=torch.bool)
@@ -935,8 +943,8 @@ class GeoNVS(nn.Module):
         self.octrees = [octree]
         self.background = None
         self.bg_color = constant(*np.nan_to_num(raw["bg_color"], nan=0.5).tolist())
-        has_view = bool(np.isnan(raw["bg_color"]).any())
-        if is_on(cfg.background, has_view):
+        has_colors = bool(np.isnan(raw["bg_color"]).any())
+        if is_on(cfg.background, has_colors):
             self.background = Background(scene.points[~is_inside], cfg.hidden, 9 + A)
             self.octrees.append(self.background.octree)
         self.deviation = Deviation()
@@ -975,7 +983,7 @@ class GeoNVS(nn.Module):
             logit = sample_logits(self.mask.logits(photos), rays.uv)  # (R,)
             mask = logit.detach().sigmoid()
             price = self.mask.price(phi, cfg.lam_mask, cfg.lam_gpl)
-            l_mask = transient_loss(logit, error * ~is_static, price)
+            l_mask = transient_loss(logit, error * ~is_static, price)  # SfM pixels: M = 0 [D10]
 
         which = random_index(gen, cfg.samples + 1, R)
         t = out["t"].gather(1, which[:, None])  # (R,1) a random sample of each ray [D13]
@@ -1050,9 +1058,10 @@ class GeoNVS(nn.Module):
             dict(params=mask, lr=8e-3)]
 
     def start(self, gen, steps=200, radius=0.25):
-        """Warm-up: L_sphere fits the SDF to a sphere. A small one: a surface that starts inside the
-        landmark grows to it, one that starts outside also has to be carved out of the sky."""
-        grid, *networks = self.sdf.parameters()
+        """Warm-up: L_sphere = (s(x) - (|x| - radius))^2. A small sphere: a surface that starts
+        inside the landmark grows to it, one that starts outside also has to be carved out of the
+        sky."""
+        grid, *networks = self.sdf.parameters()  # the octree's features come first
         groups = [
             dict(params=[grid], lr=1e-3),
             dict(params=networks, lr=5e-3)]
@@ -1071,7 +1080,7 @@ class GeoNVS(nn.Module):
         octree = self.sdf.octree
         keys = refined_keys(octree, self.distance, self.deviation().item())
         state = optimizer.state.pop(octree.features)
-        old_row = octree.build(from_first_process(keys))
+        old_row = octree.build(from_first_process(keys.cpu()).to(keys.device))
         for name in ("exp_avg", "exp_avg_sq"):
             state[name] = carry_rows(state[name], old_row)
         optimizer.state[octree.features] = state
@@ -1121,8 +1130,8 @@ def open_counter(device, rapl="/sys/class/powercap"):
 
 
 class EnergyMeter:
-    """Joules counted from tick to tick, on top of those given; None, never 0, from where on nothing
-    counts. A counter that starts again from zero between two ticks loses what it counted there."""
+    """Joules counted from tick to tick, on top of those given; None, never 0, once a counter has
+    failed. A counter that starts again from zero between two ticks loses what it counted there."""
     def __init__(self, device, joules=0.0):
         self.device = device
         self.joules = joules
@@ -1180,7 +1189,7 @@ def average_gradients(model):
 
 def training_step(model, optimizer, photos, step, done, gen):
     """One update; the learning rate rises for 20 steps, then follows a cosine down to 5 %. done:
-    share of training, 0..1. Returns the raw terms of the loss. Asks the device for no value."""
+    share of training, 0..1. Returns the raw terms of the loss. Never waits for the device."""
     model.before_step(step, done)
     rays, picked = model.batch(photos, model.cfg.rays // RANKS, gen)
     loss, terms, out = model.losses(rays, picked, step, gen)
@@ -1514,10 +1523,10 @@ def toy_truth(model, scene):
 
 @torch.no_grad()
 def extract_mesh(model):
-    """The surface s = 0 in the unit sphere, open where it meets that, by marching cubes with two
-    cells per finest octree cell, at most 512: vertices (N,3) in SfM units, faces (M,3), colours
-    (N,3) uint8 as seen along the normals under the mean code. Corners near the surface are
-    evaluated, elsewhere the cache has the sign."""
+    """The surface s = 0, cut open at the unit sphere, by marching cubes with two cells per finest
+    octree cell, at most 512: vertices (P,3) in SfM units, faces (F,3), colours (P,3) uint8 as seen
+    along the normals under the mean code. s is evaluated near the surface; elsewhere the cache
+    gives its sign."""
     cache = model.cache.volume
     n = min(round(2 / model.eps), 512)
     size = [n + 1] * 3
