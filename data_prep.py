@@ -95,8 +95,7 @@ def progress(items, what):
         is_last = done == total
         if past > due or (is_last and past > 10):
             due = past + wait
-            left = past / done * (total - done)
-            line = f"  {what}: {done} of {total}, {left:.0f} s left "
+            line = f"  {what}: {done} of {total}, {past / done * (total - done):.0f} s left "
             if is_terminal:
                 print("\r" + line, end="\n" if is_last else "", flush=True)
             else:
@@ -112,8 +111,7 @@ def atomic_write(path, write):
         check(result is not False, f"cannot encode {path}")   # so cv2.imwrite says no
         os.replace(part, path)
     except OSError as e:
-        why = e.strerror or e
-        raise UserError(f"cannot write {path} ({why}): free or choose a place") from e
+        raise UserError(f"cannot write {path} ({e.strerror or e}): free or choose a place") from e
     finally:
         if part.exists():
             part.unlink()
@@ -244,10 +242,11 @@ def toy_parts(landmark, background):
         rng = np.random.default_rng([landmark, 1])
         for first, last in GROUPS:   # stretch and move
             group = parts[first:last]
+            place = group[:, 1:4]
             size = rng.uniform(.7, 1.2, 3)
             shift = np.append(rng.uniform(-.06, .06, 2), 0)
-            foot = np.append(group[:, 1:3].mean(0), group[0, 3] - group[0, 4])
-            group[:, 1:4] = foot + (group[:, 1:4] - foot) * size + shift
+            foot = np.append(place[:, :2].mean(0), place[0, 2] - group[0, 4])
+            place[:] = foot + (place - foot) * size + shift
             is_box = group[:, :1] == 1   # others stay round
             group[:, 4:8] *= where(is_box, size[[2, 0, 0, 1]], size[2])
         parts[:, 1] *= rng.choice((-1, 1))
@@ -513,7 +512,7 @@ def make_toy(seed=0, size=96, photos=48, test=8, occluders=0.05, exposure=1.0, p
     turns = radians(day.uniform(-sun, sun, count))
     suns = [cv2.Rodrigues(array([0, 0, turn]))[0] @ SUN for turn in turns]
     parts = toy_parts(landmark, background)
-    images, depth, occluder = [], [], []
+    depth, images, occluder = [], [], []
     for i in progress(range(count), "drawing photos"):
         K, c2w, w, h = views[i]
         o = np.broadcast_to(c2w[:, 3], (w * h, 3))
@@ -541,9 +540,7 @@ def make_toy(seed=0, size=96, photos=48, test=8, occluders=0.05, exposure=1.0, p
     name = [f"toy_{i:03d}.png" for i in range(count)]
     scene = finish(images, K, c2w, is_test, name, points, tracks, info, contain)
     depth = concatenate(depth) * TOY_SCALE / scene["scale"]
-    scene["depth"] = depth.astype(np.float16)
-    scene["occluder"] = concatenate(occluder)
-    return scene
+    return scene | dict(depth=depth.astype(np.float16), occluder=concatenate(occluder))
 
 
 # ---- from photos, poses and points to a scene ----------------------------------------------------
@@ -652,8 +649,8 @@ def statistics(scene):
 
 # ---- folders with photos and COLMAP models -------------------------------------------------------
 PHOTO_TYPES = ".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"
-# By COLMAP's number of a camera model: how many numbers it has. A letter is one of those that are
-# read here: focal lengths, centre, distortion as in OpenCV.
+# By COLMAP's number of a camera model: how many numbers it has; and how many focal lengths, which
+# come first, before centre and distortion.
 PARAMETERS = [int(count) for count in "3 4 4 5 8 8 12 5 4 5 12 16 4 5 3 4 6 2".split()]
 FOCAL_LENGTHS = {0: 1, 1: 2, 2: 1, 3: 1, 4: 2, 6: 2}   # not of fisheye and other models
 
@@ -661,11 +658,12 @@ FOCAL_LENGTHS = {0: 1, 1: 2, 2: 1, 3: 1, 4: 2, 6: 2}   # not of fisheye and othe
 @dataclass
 class Photo:
     """A photo as a model has it, in SfM units."""
-    wh: tuple
-    K: np.ndarray   # (4,)
-    bend: np.ndarray   # k1 k2 p1 p2 k3 .. k6 of OpenCV
-    c2w: np.ndarray   # (3,4)
-    points: list   # ids, then rows, of the points that it observes
+    fault: str = ""   # why it cannot be used; then nothing else is known
+    wh: tuple = ()
+    K: np.ndarray = None   # (4,)
+    bend: np.ndarray = None   # k1 k2 p1 p2 k3 .. k6 of OpenCV
+    c2w: np.ndarray = None   # (3,4)
+    points: list = ()   # ids, then rows, of the points that it observes
 
 
 def open_binary(path):
@@ -699,14 +697,12 @@ def make_photo(camera, pose, ids):
     turn = cross(v, eye(3))
     R = eye(3) + 2 * w * turn + 2 * turn @ turn   # camera to world
     c2w = np.column_stack([R, -R @ pose[4:]])
-    return Photo(tuple(wh), numbers[[0, n - 1, n, n + 1]], bend, c2w, ids)
+    return Photo("", tuple(wh), numbers[[0, n - 1, n, n + 1]], bend, c2w, ids)
 
 
 def read_photos(sparse):
-    """{name: Photo} of a COLMAP model, and {name: fault} of those that cannot be used."""
-    cameras = {}
-    photos = {}
-    faults = {}
+    """{name: Photo} of a COLMAP model."""
+    cameras, photos = {}, {}
     read = open_binary(sparse / "cameras.bin")
     for _ in range(*read("Q")):
         key, model, w, h = read("IiQQ")
@@ -721,13 +717,12 @@ def read_photos(sparse):
         ids = np.frombuffer(read(24 * count), "<u8")[2::3].tolist()   # of u, v, point
         is_inside = name and name[0] != "/" and "\\" not in name and ".." not in name.split("/")
         check(is_inside, f"{sparse}: photo {name!r} is outside the image folder: rename it")
-        is_new = name not in photos and name not in faults
-        check(is_new, f"{sparse}: photo {name!r} occurs twice: export the model again")
+        check(name not in photos, f"{sparse}: photo {name!r} occurs twice: export the model again")
         try:
             photos[name] = make_photo(cameras.get(camera), pose, ids)
         except UserError as e:
-            faults[name] = str(e)
-    return photos, faults
+            photos[name] = Photo(str(e))
+    return photos
 
 
 def read_points(sparse):
@@ -736,8 +731,7 @@ def read_points(sparse):
     triangulate = f"run colmap point_triangulator with --input_path {sparse}"
     check(path.is_file(), f"{path} is missing: {triangulate}")
     read = open_binary(path)
-    points = []
-    rows = {}
+    points, rows = [], {}
     for _ in range(*read("Q")):
         key, x, y, z, *_, error, views = read("Q3d3BdQ")
         read(8 * views)
@@ -745,8 +739,7 @@ def read_points(sparse):
             rows[key] = len(points)
             points.append((x, y, z, error, views))
     points = array(points, float).reshape(-1, 5)
-    has_tracks = (points[:, 4] > 1).any()
-    check(has_tracks, f"{path} has {len(points)} points, none with a track: {triangulate}")
+    check(max(points[:, 4], default=0) > 1, f"{path} has {len(points)} points, none with a track: {triangulate}")
     return points, rows
 
 
@@ -761,11 +754,10 @@ def photo_files(folder):
     return files
 
 
-def renamed(names, files):
-    """Says how names that are no file's come to be so, if folder or extension is all there is."""
-    stems = {stem(file): file for file in files}
-    pairs = [f"{name} is {stems[stem(name)]}" for name in names if stem(name) in stems]
-    return f" by another folder or extension ({', '.join(pairs[:3])})" if pairs else ""
+def renamed(name, others):
+    """Says which of the others the name means, if folder or extension alone differ."""
+    same = [other for other in others if stem(other) == stem(name)]
+    return f"; {same[0]} has another folder or extension" if same else ""
 
 
 def stem(name):
@@ -780,17 +772,14 @@ def model_folders(folder, name="images.bin"):
 
 def open_model(folder, sparse):
     """A model with that folder of photos around it in which most of its photos are."""
-    photos, faults = read_photos(sparse)
-    known = photos.keys() | faults.keys()
+    photos = read_photos(sparse)
     around = [sparse, *sparse.parents]
     around = around[:around.index(folder) + 1]
     places = [place / name for place in around for name in ("images", "input", "")]
-    images = max(places, key=lambda place: len(known & photo_files(place).keys()))
+    images = max(places, key=lambda place: len(photos.keys() & photo_files(place)))
     files = photo_files(images)
-    names = sorted(known & files.keys())   # posed, and on disk
-    usable = len(photos.keys() & files.keys())
-    return SimpleNamespace(sparse=sparse, photos=photos, faults=faults, known=known, images=images,
-                           files=files, names=names, usable=usable)
+    names = sorted(photos.keys() & files)   # posed, and on disk
+    return SimpleNamespace(sparse=sparse, photos=photos, images=images, files=files, names=names)
 
 
 def find_model(folder, command):
@@ -801,15 +790,16 @@ def find_model(folder, command):
           f"--output_type BIN with input and output path {' or '.join(map(str, texts))}")
     check(places, f"{folder} has no COLMAP model; run: python data_prep.py {command}")
     models = [open_model(folder, place) for place in places]
-    best = max(models, key=lambda model: model.usable)
-    hint = renamed(best.known, map(str, folder.rglob("*")))
-    check(best.names, f"no photo of {best.sparse} is on disk{hint}: put them into {folder}/images, "
-          f"or run: python data_prep.py {command}")
+    best = max(models, key=lambda model: sum(not model.photos[n].fault for n in model.names))
+    first = min(best.photos, default="")
+    hint = renamed(first, map(str, folder.rglob("*")))
+    check(best.names, f"no photo of {best.sparse} is on disk, such as {first}{hint}: put them into "
+          f"{folder}/images, or run: python data_prep.py {command}")
     on_disk = max(len(model.files) for model in models if model.names)
     print(f"{best.images}: {on_disk} photos on disk, {len(best.names)} posed by {best.sparse}")
     for model in models:
-        if model.known != best.known:
-            print(f"left out is another model: {len(model.known)} posed by {model.sparse}")
+        if model.photos.keys() != best.photos.keys():
+            print(f"left out is another model: {len(model.photos)} posed by {model.sparse}")
     return best
 
 
@@ -861,8 +851,8 @@ def fingerprint(folder, images, split):
     for place in model_folders(folder):
         paths += place.glob("*.bin")
     paths += [Path(split)] if split else []
-    stats = [(path, path.stat()) for path in sorted(paths) if path.exists()]
-    lines = [f"{path} {stat.st_size} {stat.st_mtime_ns}" for path, stat in stats]
+    paths = [path for path in sorted(paths) if path.exists()]
+    lines = [f"{path} {path.stat().st_size} {path.stat().st_mtime_ns}" for path in paths]
     return zlib.crc32(os.fsencode("\n".join(lines)))
 
 
@@ -913,10 +903,6 @@ def choose_parts(folder, model, split):
         return {n: "test" if i % 8 == 7 else "train" for i, n in enumerate(model.names)}
     parts = read_split(table)
     print(f"split by {table}")
-    lost = parts.keys() - set(model.names)
-    if lost:
-        hint = renamed(lost, model.names)
-        warn(f"{len(lost)} photos of {table} have no pose or no file{hint}: {min(lost)} ...")
     rest = set(model.names) - parts.keys()
     if rest:
         warn(f"{len(rest)} photos are not in {table}: {min(rest)} ...")
@@ -925,13 +911,13 @@ def choose_parts(folder, model, split):
 
 def read_usable(model, parts, downscale):
     """{name: (rgb, K)} of the photos that can be used; says which cannot, and why."""
-    usable = {}
-    faults = {}
+    usable, faults = {}, {}
     for name in progress(sorted(parts), "preparing photos"):
         try:
-            check(name in model.names, "has no pose or no file")
-            check(name in model.photos, model.faults.get(name))
+            hint = renamed(name, model.names)
+            check(name in model.names, f"has no pose or no file{hint}")
             photo = model.photos[name]
+            check(not photo.fault, photo.fault)
             angle = 2 * np.degrees(np.arctan(max(photo.wh / photo.K[:2]) / 2))
             is_usual = parts[name] == "test" or 10 <= angle <= 120
             check(is_usual, f"is {angle:.1f} degrees wide, which is not in 10..120")

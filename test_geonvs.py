@@ -947,7 +947,7 @@ BAD = [   # what is changed of the model or on disk, and what the sentence says
     (lambda m: m.points.__delitem__(slice(9, None)), "overlapping photos"),
     (at_one_place, "coincide"), (only_tests_see, "no training photo"),
     (all_fisheye, "colmap image_undistorter"), (unknown_camera, "colmap image_undistorter"),
-    (as_text, "colmap model_converter"), (renamed_photos, "another folder or extension"),
+    (as_text, "colmap model_converter"), (renamed_photos, "toy_000.jpg has another folder or extension"),
     (smaller_photos, "has 9 x 7 pixels, its camera 27 x 40"), (two_tables, "--split"),
     (named("toy_001.png"), "toy_001.png' occurs twice"), (named("../toy_000.png"), "outside"),
     (named("/toy_000.png"), "outside"), (named("..\\toy_000.png"), "outside"), (named(""), "outside"),
@@ -1209,8 +1209,8 @@ def test_names_with_another_folder_or_extension_are_said_to_be_such(model):
     text = TABLE.read_text().replace("toy_000.png", "images/toy_000.jpg")
     TABLE.write_text(text + "12.0\ttrain\tghost.png\ttoy\n")
     names, out, err = held_out()
-    assert "2 photos of place/toy.tsv have no pose or no file by another folder or extension" in err
-    assert "images/toy_000.jpg is toy_000.png" in err
+    assert "images/toy_000.jpg has no pose or no file; toy_000.png has another folder or exten" in err
+    assert "ghost.png has no pose or no file\n" in err
 
 
 # ---- freshness -----------------------------------------------------------------------------------
@@ -1510,7 +1510,7 @@ def pycolmap(desk, monkeypatch, source):
     calls = []
 
     def note(name, result=None):
-        def call(*args):
+        def call(*args, **options):
             calls.append((name, *args[:3]))
             return result() if callable(result) else result
         return call
@@ -1519,7 +1519,8 @@ def pycolmap(desk, monkeypatch, source):
         calls=calls, photos=photos, extract_features=note("extract"), match_exhaustive=note("match"),
         incremental_mapping=note("map", found), undistort_images=note(
             "undistort", lambda: write_folder(photos, source)),
-        IncrementalPipelineOptions=lambda: SimpleNamespace(mapper=SimpleNamespace()))
+        FeatureExtractionOptions=lambda: SimpleNamespace(sift=SimpleNamespace()),
+        FeatureMatchingOptions=SimpleNamespace)
     monkeypatch.setitem(sys.modules, "pycolmap", fake)
     return fake
 
