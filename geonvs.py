@@ -1105,7 +1105,9 @@ class GeoNVS(nn.Module):
         """render_rays without jitter, for pictures and for fitting codes."""
         draws = self.cfg.samples + self.cfg.bg_samples
         jitter = code.new_full((len(code), draws), 0.5)
-        return render_rays(self, rays, code, jitter)
+        out = render_rays(self, rays, code, jitter)
+        out["normal"] = out["normal"] * out["opacity"][:, None]  # 0 where nothing is
+        return out
 
 
 # ---- 8 Energy ------------------------------------------------------------------------------------
