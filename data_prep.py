@@ -925,7 +925,8 @@ def read_usable(model, parts, downscale):
         except UserError as e:
             faults[name] = f"{name} {e}"
             warn(f"left out: {name} {e}")
-    lost = "; ".join(faults[name] for name in faults if parts[name] == "test")
+    lost = [faults[name] for name in faults if parts[name] == "test"]
+    lost = "; ".join(lost[:3]) + f" and {len(lost) - 3} more" * (len(lost) > 3)
     check(not lost, f"held-out photos cannot be used: {lost}; mend them, or hold out others")
     count = sum(parts[name] == "train" for name in usable)
     first = min(faults.values(), default="mend the split file")
