@@ -236,7 +236,7 @@ def town():
 
 
 def toy_parts(landmark, background):
-    """(P,9): LANDMARK, for other numbers than 0 another building of such parts; then maybe a town."""
+    """(P,9): LANDMARK, for other numbers than 0 another building of such parts; maybe a town."""
     parts = LANDMARK.copy()
     if landmark:
         rng = np.random.default_rng([landmark, 1])
@@ -555,7 +555,7 @@ def choose_points(points):
 def find_sphere(x, weight, tracks, is_test, contain=()):
     """Centre (3,) and radius of what most photos look at; its definition is [D10].
 
-    Centre: geometric median of points x (K,3) by weight. Radius: 1.1 x the distance of 95 %. If that
+    Centre: geometric median of points x (K,3) by weight. Radius: 1.1 x the distance of 95 %; if it
     is a skyline, more than four times the median distance away, only nearer points are counted.
     Inside are at least 30 % of the points (M,) of most training photos, and contain (P,3)."""
     centre = median(x, axis=0)
@@ -739,7 +739,8 @@ def read_points(sparse):
             rows[key] = len(points)
             points.append((x, y, z, error, views))
     points = array(points, float).reshape(-1, 5)
-    check(max(points[:, 4], default=0) > 1, f"{path} has {len(points)} points, none with a track: {triangulate}")
+    has_tracks = max(points[:, 4], default=0) > 1
+    check(has_tracks, f"{path} has {len(points)} points, none with a track: {triangulate}")
     return points, rows
 
 
@@ -1065,7 +1066,8 @@ def run_sfm(folder):
     database = folder / "database.db"
     models = folder / "models"
     dense = folder / "dense"
-    check(folder.is_dir() and not dense.exists(), f"{folder} is missing, or has dense/: delete that")
+    is_new = folder.is_dir() and not dense.exists()
+    check(is_new, f"{folder} is missing, or has dense/: delete that")
     models.mkdir(exist_ok=True)
     # Of 135 photos of a statue in all lights these options pose 104 in one model instead of 60.
     features = pycolmap.FeatureExtractionOptions()
