@@ -1533,17 +1533,17 @@ def extract_mesh(model):
     n = min(round(2 / model.eps), 512)
     size = [n + 1] * 3
     volume = F.interpolate(cache, size=size, mode="trilinear", align_corners=True)[0, 0]
-    x = grid_index(n + 1, cache.device) * (2 / n) - 1  # (P,3)
-    volume = volume.flatten()  # (P,)
-    radius = x.norm(dim=1)
+    square = torch.linspace(-1, 1, n + 1, device=cache.device) ** 2
+    radius = (square[:, None, None] + square[:, None] + square).sqrt()  # (n+1,n+1,n+1)
     near = (volume.abs() < 6 / cache.shape[-1]) & (radius < 1)
-    volume[near] = in_chunks(model.distance, x[near])
+    x = near.nonzero() * (2 / n) - 1  # (P,3)
+    volume[near] = in_chunks(model.distance, x)
     is_inside = radius < 1 - 4 / n  # so that all corners of the cells there are evaluated
     if len((volume[is_inside] < 0).unique()) < 2:
         empty = np.zeros((0, 3))
         return empty, empty, empty
-    volume = volume.reshape(size).cpu().numpy()
-    mask = is_inside.reshape(size).cpu().numpy()
+    volume = volume.cpu().numpy()
+    mask = is_inside.cpu().numpy()
     vertices, faces, _, _ = marching_cubes(volume, 0, mask=mask)
     vertices = vertices * (2 / n) - 1
     x = torch.tensor(vertices, dtype=torch.float32, device=cache.device)
