@@ -24,18 +24,21 @@ Conventions
 
 Where the printed paper is departed from, the line carries its tag:
   [D1]  alpha is divided by sigmoid(zeta s_i) and never negative (printed: a wall is 63 % opaque)
-  [D2]  alpha has no beta: s is evaluated at both ends of a section, so no slope has to be guessed
+  [D2]  alpha has no beta: s is evaluated at both ends of a section, so no slope has to be guessed;
+        a section has the mean colour of its ends
   [D3]  Phi is a sigmoid of 10 E_grad + 2 |lap| eps opacity at the ray's end, set by quantiles of
         rays that end on the foreground, times opacity; it has no gradient
   [D4]  the curvature loss is |lap| eps opacity, since |lap| of a trilinear field grows as eps
         shrinks; its weight is 0.01 (printed: lambda_curv = 2 stands in Eq. 4 and in Eq. 5)
   [D5]  the Lipschitz term is a sum of logs, not a product that can drown the colour at first
   [D6]  CGNet is small and sees small square photos: one plain block a stage, GroupNorm, ReLU
-  [D7]  M is learnt by classification. A ray is transient if its error exceeds its price, which is
+  [D7]  M is learnt by classification. A ray is transient if its error (of the worst channel)
+        exceeds its price, which is
         max(upper quartile of errors at SfM pixels + lam_mask, 0.15) + lam_gpl Phi. There is no
         term for bimodality. Lessons end after 60 % of training
   [D8]  the background also fills what lies before the sphere; its last section is opaque
-  [D9]  only the colour and background networks have mixed precision: distances stay float32
+  [D9]  only the colour and background networks have mixed precision: distances stay float32 (the
+        mask's convolutions may use TF32)
   [D10] SfM points place the sphere, seed the octree, teach M = 0 and pull s(p) to zero, but less
         while zeta is below 40: a strong pull would leave the surface fog
   [D11] samples are drawn from a cached SDF volume; no second network pass along the ray
@@ -113,7 +116,7 @@ class Config:
     background: str = opt("auto", "field; auto: off if it is one colour", "auto", "on", "off")
     lam_eik: float = opt(0.04, "weight of the eikonal loss (Permuto-SDF)")
     lam_curv: float = opt(0.01, "weight of the curvature loss, on |lap| eps [D4]")
-    lam_gpl: float = opt(0.05, "weight of the geometry-preservation loss (paper)")
+    lam_gpl: float = opt(0.05, "weight of the geometry-preservation loss (paper) [D7]")
     lam_lps: float = opt(1e-5, "weight of the Lipschitz loss, log form [D5]")
     lam_off: float = opt(1e-3, "weight of the off-surface loss")
     lam_sfm: float = opt(7.5e-3, "weight of min(zeta, 40) |s(p)| at SfM points [D10]")
@@ -826,7 +829,8 @@ def edge_indicator(complexity, centre=0.0, width=1.0):
 
 
 def gpl_loss(mask, phi):
-    """Geometry-preservation loss: mean of M(r) Phi(r). Eq. 3"""
+    """Geometry-preservation loss: mean of M(r) Phi(r). Eq. 3. It is logged; it acts through the
+    price of a ray, weight included [D7]."""
     return (mask * phi).mean()
 
 
@@ -1013,7 +1017,7 @@ class GeoNVS(nn.Module):
             + cfg.lam_lps * terms["lps"]
             + cfg.lam_off * terms["off"]
             + cfg.lam_sfm * terms["sfm"]
-            + l_mask)  # lam_mask and lam_gpl are in its price
+            + l_mask)  # lam_mask L_reg + lam_gpl L_GPL, by way of its price [D7]
         out |= dict(error=error, mask=mask, is_static=is_static, detail=detail)
         return total, terms, out
 
@@ -1450,7 +1454,8 @@ def evaluate(model, scene, lpips=None):
     """Scores of the test photos by the half-image protocol [D12], per photo and on average, None
     where there are none; the first frames, (photo, title, frame), for the panel."""
     photos = scene.photos(True)  # (B,)
-    codes = fit_codes(model, scene, photos)  # (B,A)
+    codes = [fit_codes(model, scene, some) for some in photos.split(32)]
+    codes = torch.cat(codes)  # (B,A)
     rows = []
     frames = []
     pairs = list(zip(photos.tolist(), codes))
@@ -1458,12 +1463,13 @@ def evaluate(model, scene, lpips=None):
         name = str(scene.raw["name"][photo])
         frame = render_photo(model, scene, photo, code)
         rows.append(dict(name=name) | score(frame, lpips))
-        frames.append((photo, f"held out: {name}", frame))
+        if len(frames) < 2:
+            frames.append((photo, f"held out: {name}", frame))
     scores = dict(per_image=rows)
     for key in ("psnr", "psnr_floor", "ssim", "lpips"):
         values = [row[key] for row in rows if row[key] is not None]
         scores[key] = float(np.mean(values)) if values else None
-    return scores, frames[:2]
+    return scores, frames
 
 
 @torch.no_grad()
@@ -1813,7 +1819,8 @@ def run_command_line(entry):
     except UserError as error:
         message = str(error)
     except (RuntimeError, MemoryError) as error:  # a CPU's allocator has no error of its own
-        if "memory" not in repr(error).lower():
+        signs = ("MemoryError", "out of memory", "allocate memory")
+        if not any(sign in repr(error) for sign in signs):
             raise
         message = "the memory is full: begin anew with fewer --rays or a larger --downscale"
     except OSError as error:  # a full disk, a folder without permission
