@@ -1244,7 +1244,8 @@ def read_checkpoint(path, given):
         data_prep.refuse_bomb(path)
         saved = torch.load(path, map_location="cpu", weights_only=True)
         cfg = Config(**saved["config"])
-        check(saved["state"]["step"] >= 0, "negative")
+        numbers = [saved["state"][key] for key in ("step", "refined", "seconds")]
+        check(min(numbers) >= 0 and "joules" in saved["state"], "state")
     except Exception as error:  # a damaged file can fail in any layer: zip, pickle, tensor storage
         raise UserError(f"{path} is damaged, too large for the memory or of another program "
                         f"({type(error).__name__}): train again under another --name") from None
