@@ -134,7 +134,6 @@ class Config:
             if setting.type is not str:
                 least = AT_LEAST.get(setting.name, 0)
                 check(least <= value < 2**31, f"{flag}: use a number from {least}")
-        check(self.rays % self.photos == 0, "--rays must be a multiple of --photos")
 
     @property
     def source(self):
@@ -878,14 +877,6 @@ class TransientMask(nn.Module):
         """Logits (B,1,m,m) of photos (B,)."""
         return self.cgnet(self.thumbs[photos] / 255)
 
-    def share(self, photos):
-        """Mean M (B,) of photos (B,)."""
-        means = []
-        for one in photos.split(1):
-            M = self.logits(one).sigmoid()
-            means.append(M.mean())
-        return torch.stack(means)
-
     def is_static(self, rays):
         """Which rays (R,) go through pixels that show SfM points."""
         pixel = (rays.uv * self.static.shape[1]).long()  # (R,2)
@@ -1095,8 +1086,9 @@ class GeoNVS(nn.Module):
     def decide_mask(self):
         """--mask auto: off if M marks hardly anything in the training photos. [D15]"""
         if self.cfg.mask == "auto":
-            shares = self.mask.share(self.scene.photos(False))
-            share = shares.mean().item()
+            photos = self.scene.photos(False)
+            logits = [self.mask.logits(some) for some in photos.split(32)]
+            share = torch.cat(logits).sigmoid().mean().item()
             is_needed = from_first_process(share > 0.01)
             self.cfg.mask = "on" if is_needed else "off"
             print(f"  mean mask {share:.4f}: mask {self.cfg.mask}")
@@ -1187,10 +1179,10 @@ def sum_over_processes(value):
 
 
 def average_gradients(model):
-    grads = [p.grad for p in model.parameters() if p.grad is not None]
-    flat = nn.utils.parameters_to_vector(grads)
-    dist.all_reduce(flat)
-    nn.utils.vector_to_parameters(flat / RANKS, grads)
+    for p in model.parameters():
+        if p.grad is not None:
+            dist.all_reduce(p.grad)
+            p.grad /= RANKS
 
 
 def training_step(model, optimizer, photos, step, done, gen):
@@ -1335,11 +1327,10 @@ def report(model, path, done, state, terms):
     gen = torch.Generator(model.scene.c2w.device).manual_seed(0)
     rays, _ = model.batch(model.scene.photos(False), 1024, gen)
     out = model.render(rays, model.codes()[rays.img])
-    line = state | dict(psnr=psnr(out["rgb"], rays.rgb))
-    for key, value in terms.items():
-        line[key] = float(value)
+    numbers = {key: float(value) for key, value in terms.items()}
+    line = state | numbers | dict(psnr=psnr(out["rgb"], rays.rgb))
     with open(path, "a") as file:
-        file.write(json.dumps(line) + "\n")
+        print(json.dumps(line), file=file)
     left = state["seconds"] / 60 * max(0, 1 / max(done, 1e-3) - 1)
     print(f"  step {state['step']:6d}  psnr {line['psnr']:.2f}  {left:.1f} min left", flush=True)
 
@@ -1359,19 +1350,13 @@ def psnr(a, b):
 
 
 def make_lpips(device):
-    """Learned perceptual distance of two pictures in 0..1 (AlexNet, v0.1), or None with a line."""
+    """The network of LPIPS, a learned perceptual distance (AlexNet, v0.1), or None with a line."""
     try:
         import lpips
-        net = lpips.LPIPS(net="alex", verbose=False).to(device)
+        return lpips.LPIPS(net="alex", verbose=False).to(device)
     except Exception as error:  # not installed, or its weights cannot be fetched
         print(f"  lpips is null ({error}): pip install lpips, with a network for its weights")
         return None
-
-    def distance(*pictures):
-        batch = torch.as_tensor(np.stack(pictures), device=device).float()
-        a, b = batch.permute(0, 3, 1, 2).split(1)  # (1,3,H,W)
-        return net(a, b, normalize=True).item()
-    return distance
 
 
 def mean_code(model):
@@ -1447,7 +1432,9 @@ def score(frame, lpips=None):
             use_sample_covariance=False)
         row["ssim"] = float(ssim)
     if lpips and side >= 32:
-        row["lpips"] = lpips(got, want)
+        batch = torch.tensor(np.stack([got, want])).float()  # (2,H,W,3)
+        a, b = batch.permute(0, 3, 1, 2).split(1)  # (1,3,H,W)
+        row["lpips"] = lpips(a, b, normalize=True).item()
     return row
 
 
@@ -1534,26 +1521,21 @@ def toy_truth(model, scene):
 def extract_mesh(model):
     """The surface s = 0, cut open at the unit sphere, by marching cubes with two cells per finest
     octree cell, at most 512: vertices (P,3) in SfM units, faces (F,3), colours (P,3) uint8 as seen
-    along the normals under the mean code. s is evaluated near the surface; elsewhere the cache
-    gives its sign."""
-    cache = model.cache.volume
+    along the normals under the mean code."""
     n = min(round(2 / model.eps), 512)
-    size = [n + 1] * 3
-    volume = F.interpolate(cache, size=size, mode="trilinear", align_corners=True)[0, 0]
-    square = torch.linspace(-1, 1, n + 1, device=cache.device) ** 2
-    radius = (square[:, None, None] + square[:, None] + square).sqrt()  # (n+1,n+1,n+1)
-    near = (volume.abs() < 6 / cache.shape[-1]) & (radius < 1)
-    x = near.nonzero() * (2 / n) - 1  # (P,3)
-    volume[near] = in_chunks(model.distance, x)
-    is_inside = radius < 1 - 4 / n  # so that all corners of the cells there are evaluated
-    if len((volume[is_inside] < 0).unique()) < 2:
+    grid = SDFCache(n + 1).to(model.cache.volume)
+    for part in range(n + 1):
+        grid.refresh(model.distance, part, n + 1)
+    volume = grid.volume[0, 0].cpu().numpy()
+    square = np.linspace(-1, 1, n + 1) ** 2
+    radius = np.sqrt(square[:, None, None] + square[:, None] + square)  # (n+1,n+1,n+1)
+    is_inside = radius < 1
+    if len(np.unique(volume[is_inside] < 0)) < 2:
         empty = np.zeros((0, 3))
         return empty, empty, empty
-    volume = volume.cpu().numpy()
-    mask = is_inside.cpu().numpy()
-    vertices, faces, _, _ = marching_cubes(volume, 0, mask=mask)
+    vertices, faces, _, _ = marching_cubes(volume, 0, mask=is_inside)
     vertices = vertices * (2 / n) - 1
-    x = torch.tensor(vertices, dtype=torch.float32, device=cache.device)
+    x = torch.tensor(vertices, dtype=torch.float32, device=grid.volume.device)
     colors = in_chunks(lambda part: surface_color(model, part), x)
     raw = model.scene.raw
     return vertices * raw["scale"] + raw["center"], faces, to_uint8(colors.cpu())
@@ -1595,24 +1577,23 @@ end_header
 
 
 def write_panel(path, model, frames, width=240):
-    """A row for each (photo, title, frame): photo, render, and of our model the normals of the
-    surface and what the mask network says of the photo."""
+    """A row for each (photo, title, frame): photo, render, normals of the surface and what the
+    mask network says of the photo."""
     rows = []
     for photo, title, frame in frames:
         tiles = {title: frame["truth"], "render": frame["rgb"]}
-        if isinstance(model, GeoNVS):
-            tiles["normals"] = frame["normal"] / 2 + 0.5
-        if isinstance(model, GeoNVS) and model.cfg.mask != "off":
+        tiles["normals"] = frame["normal"] / 2 + 0.5
+        if model.cfg.mask != "off":
             M = model.mask.logits([photo]).detach().sigmoid()  # (1,1,m,m)
             colors = cv2.applyColorMap(to_uint8(M[0, 0].cpu()), cv2.COLORMAP_VIRIDIS)
             tiles["mask: yellow is transient"] = colors[:, :, ::-1] / 255
         h, w = frame["rgb"].shape[:2]
+        size = (width, width * h // w)
         row = []
         for text, tile in tiles.items():
-            size = (width, width * h // w)
             tile = cv2.resize(to_uint8(tile), size, interpolation=cv2.INTER_AREA)
             tile = np.pad(tile, ((20, 4), (0, 4), (0, 0)), constant_values=255)
-            cv2.putText(tile, text, (2, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.4, (0, 0, 0), 1, 16)
+            cv2.putText(tile, text, (2, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.4, (0, 0, 0))
             row.append(tile)
         rows.append(np.concatenate(row, 1))
     picture = np.concatenate(rows)[:, :, ::-1]
@@ -1633,10 +1614,7 @@ def finish(model, scene, state, run):
         write_ply(run / "mesh.ply", *extract_mesh(model))
         if scene.info["kind"] == "toy":
             scores |= toy_truth(model, scene)
-        photos = scene.photos(False)
-        with torch.no_grad():
-            order = model.mask.share(photos).argsort(descending=True)
-        for photo in photos[order[:2]].tolist():  # with most on the mask
+        for photo in scene.photos(False)[:2].tolist():
             frame = render_photo(model, scene, photo, model.codes()[photo])
             frames.append((photo, f"training: {scene.raw['name'][photo]}", frame))
     write_panel(run / "panel.png", model, frames)
@@ -1666,44 +1644,39 @@ def finish(model, scene, state, run):
     return metrics
 
 
-def in_between(keys, n=48):
+def in_between(keys, n):
     """n rows (n,D) evenly along the polyline through keys (B,D)."""
     return F.interpolate(keys.T[None], n, mode="linear", align_corners=True)[0].T
 
 
-def film(model, scene, path, pixels=40_000):
-    """mp4 at 24 frames/s: a path through the training cameras, from one end to the other, then one
-    view through the photos' lights. Frames are as large as photos, or have so many pixels."""
+def film(model, scene, path):
+    """mp4 at 24 frames/s: past the training cameras, from one end to the other, in the light of
+    their photos."""
     photos = scene.photos(False)
     centre = scene.c2w[photos, :, 3]  # (B,3)
     axis = centre.std(0).argmax()  # along which cameras spread most
     photos = photos[centre[:, axis].argsort()]
     stops = photos[::math.ceil(len(photos) / 7)]
-    path_c2w = in_between(scene.c2w[stops].flatten(1))
-    path_c2w = path_c2w.reshape(-1, 3, 4)
-    left, _, right = torch.linalg.svd(path_c2w[:, :, :3])
-    sign = torch.linalg.det(left @ right)  # -1 for a reflection
-    left[:, :, 2] *= sign[:, None]
-    path_c2w[:, :, :3] = left @ right  # the nearest rotation
-    codes = model.codes()[photos]
-    view = photos[len(photos) // 2]
-    shots = [(c2w, codes.mean(0)) for c2w in path_c2w]
-    if codes.numel() > 0:
-        shots += [(scene.c2w[view], code) for code in in_between(codes)]
-    wh = scene.wh[view]
-    scale = (pixels / wh.prod()).sqrt().clamp(max=1)
-    wh = (wh * scale / 2).long() * 2  # even sides
+    frames = 24 * len(stops)
+    c2w = in_between(scene.c2w[stops].flatten(1), frames).reshape(-1, 3, 4)
+    codes = in_between(model.codes()[stops], frames)  # (n,A)
+    z = F.normalize(c2w[:, :, 2])  # (n,3) forward
+    x = F.normalize(torch.cross(c2w[:, :, 1], z))
+    y = torch.cross(z, x)
+    c2w = torch.stack([x, y, z, c2w[:, :, 3]], 2)  # rotations again
+    middle = stops[len(stops) // 2]
+    wh = scene.wh[middle] // 2 * 2  # codecs want even sides
     one = scene._replace(
         wh=wh[None],
-        K=scene.K[view][None] * scale,
+        K=scene.K[middle][None],
         near=scene.near[photos].min()[None])  # as cameras between the photos may be nearer
 
     def write(part):
         codec = cv2.VideoWriter_fourcc(*"mp4v")
         video = cv2.VideoWriter(str(part), codec, 24, wh.tolist())
         check(video.isOpened(), "OpenCV cannot write mp4 here")
-        for c2w, code in progress(shots, f"filming {len(shots)} frames"):
-            frame = render_photo(model, one._replace(c2w=c2w[None]), 0, code)
+        for view, code in progress(list(zip(c2w, codes)), f"filming {frames} frames"):
+            frame = render_photo(model, one._replace(c2w=view[None]), 0, code)
             video.write(to_uint8(frame["rgb"][:, :, ::-1]))
         video.release()
         return part.stat().st_size > 0
@@ -1738,11 +1711,11 @@ def make_parser():
 def pick_device(name):
     """The device of this process: with torchrun each has its own GPU."""
     count = torch.cuda.device_count()
-    there = ["cpu"] + [f"cuda:{i}" for i in range(count)]
     if name == "auto":
-        name = "cuda" if len(there) > 1 else "cpu"
+        name = "cuda" if count > 0 else "cpu"
     if name == "cuda":
         name = f"cuda:{LOCAL_RANK}"
+    there = ["cpu"] + [f"cuda:{i}" for i in range(count)]
     check(name in there, f"--device {name} is not there: this machine has {', '.join(there)}")
     return torch.device(name)
 
@@ -1780,20 +1753,15 @@ def main(argv=None):
     given = vars(make_parser().parse_args(argv))
     resume = given.pop("resume", False)
     render = given.pop("render", False)
-    saved = None
-    found_by = ("scene", "data", "name", "seed")
-    names = {key: value for key, value in given.items() if key in found_by}
-    cfg = make_config(names if resume or render else given)
+    cfg = make_config(given)
     scene_file = data_prep.scene_path(cfg.source)
     run = Path("runs", cfg.name or f"{scene_file.stem}-{GeoNVS.name}-{cfg.seed}")
     path = run / "checkpoint.pt"
+    saved = None
     if resume or render:
-        if "steps" in given:
-            given.setdefault("minutes", 0.0)  # of two budgets the last one given
         saved, cfg = read_checkpoint(path, given)
-    check(cfg.rays % (cfg.photos * RANKS) == 0 and cfg.rays > RANKS,
+    check(cfg.rays % (cfg.photos * RANKS) == 0,
           f"--rays {cfg.rays} must be a multiple of --photos {cfg.photos} times {RANKS} processes")
-    check(RANKS == 1 or not render, "--render takes one process: start it without torchrun")
     device = pick_device(cfg.device)
     if RANKS > 1:
         start_processes(device)
@@ -1802,9 +1770,7 @@ def main(argv=None):
     from_first_process(None)  # the others wait for it
     scene = load_scene(data_prep.open_scene(cfg.source, cfg.downscale), device)
     if render:
-        with device:
-            model = GeoNVS(cfg, scene)
-        restore(saved, path, model, torch.Generator(device))
+        model, _ = restore(saved, path, cfg, scene, torch.Generator(device))
         film(model, scene, run / "film.mp4")
     else:
         execute(cfg, scene, run, saved)
