@@ -46,7 +46,8 @@ SCENES = {
 ARCHIVE_URL = "https://www.cs.ubc.ca/research/kmyi_data/imw2020/TrainingData/"
 SPLIT_URL = "https://nerf-w.github.io/data/selected_images/"
 # A scene is one .npz of these arrays: I photos, J = I + 1, N pixels, K points, T observations. A
-# toy has two more: depth float16 (N,), true distance, inf is sky; occluder bool (N,), by people.
+# toy has more: depth float16 (N,), true distance, inf is sky; occluder bool (N,), by people; and
+# what toy_walls returns.
 FORMAT = dict(
     rgb="uint8 N3",
     start="int64 J",   # photo i is rgb[start[i]:start[i + 1]], row by row
@@ -528,6 +529,7 @@ def make_toy(seed=0, size=96, photos=48, test=8, occluders=0.05, exposure=1.0, p
         depth.append(trace(o, rays(K, c2w, w, h), parts, background)[0])
         occluder.append(cover[:, 3] > 0)
     points, tracks = toy_points(sfm, views, depth, occluder)
+    walls = [c2w[:, 3] + rays(K, c2w, w, h) * z[:, None] for (K, c2w, w, h), z in zip(views, depth)]
     for (K, c2w, *_), held_out in zip(views, is_test):
         shake_camera(shake, K, c2w, pose_noise * (not held_out))
         c2w[:, 3] = c2w[:, 3] * TOY_SCALE + TOY_ORIGIN
@@ -539,8 +541,30 @@ def make_toy(seed=0, size=96, photos=48, test=8, occluders=0.05, exposure=1.0, p
     K, c2w, *_ = zip(*views)
     name = [f"toy_{i:03d}.png" for i in range(count)]
     scene = finish(images, K, c2w, is_test, name, points, tracks, info, contain)
-    depth = concatenate(depth) * TOY_SCALE / scene["scale"]
-    return scene | dict(depth=depth.astype(np.float16), occluder=concatenate(occluder))
+    scene["depth"] = (concatenate(depth) * TOY_SCALE / scene["scale"]).astype(np.float16)
+    scene["occluder"] = concatenate(occluder)
+    walls = concatenate(walls)[::9] * TOY_SCALE + TOY_ORIGIN
+    walls = (walls - scene["center"]) / scene["scale"]
+    walls = walls[norm(walls, axis=1) < 0.95]
+    return scene | toy_walls(scene, walls, background, landmark)
+
+
+def toy_walls(scene, wall, background, landmark):
+    """What scores of geometry need, in scene units: visible walls (P,3) where they are smooth and
+    their normals; points near walls, and the true signed distance there."""
+    def sdf(x):   # (P,3) -> (P,)
+        world = x * scene["scale"] + scene["center"]
+        return toy_sdf(world, background, landmark) / scene["scale"]
+
+    step = 0.004
+    ends = [sdf(wall + axis) - sdf(wall - axis) for axis in step * np.eye(3)]
+    normal = np.stack(ends, 1) / (2 * step)   # (P,3)
+    is_smooth = abs(norm(normal, axis=1) - 1) < 0.01
+    near = wall + np.random.default_rng(0).normal(0, 0.02, wall.shape)
+    s = sdf(near)
+    is_near = abs(s) < 0.05
+    return dict(wall=wall[is_smooth], wall_normal=normal[is_smooth], near_wall=near[is_near],
+                near_wall_sdf=s[is_near])
 
 
 # ---- from photos, poses and points to a scene ----------------------------------------------------

@@ -178,7 +178,7 @@ class Scene(NamedTuple):
 def load_scene(raw, device="cpu"):
     """Scene from the dictionary of a scene file (data_prep.open_scene, make_toy or prepare)."""
     usual = np.median(raw["wh"].max(1))  # px
-    side = int(np.clip(usual / 2, 96, 256))  # [D6]
+    side = int(np.clip(usual / 2, 64, 256))  # [D6]
     thumbs = []
     for first, (w, h) in zip(raw["start"], raw["wh"]):
         photo = raw["rgb"][first:first + w * h]
@@ -470,6 +470,7 @@ def refined_keys(octree, sdf, zeta):
 
 # ---- 4 Fields: the networks on top of the octree -------------------------------------------------
 
+SPHERE = 0.25  # radius of the sphere that training starts from
 GEO = 15  # length of the geometry feature that the SDF network hands to the colour network
 MIXED_ON = {"cuda"}  # devices whose colour and background networks run in bfloat16 [D9]
 
@@ -508,15 +509,24 @@ def finite_differences(s, taps, eps):
     return grad, lap
 
 
+def eikonal(grad):
+    """E_grad = (|grad s| - 1)^2 (P,) of gradients (P,3): a distance grows by 1 a unit."""
+    return (grad.norm(dim=1) - 1) ** 2
+
+
 class SDFField(nn.Module):
     """s(x) and what colour is read from: a geometry feature beside the octree's own features. One
-    hidden layer over xyz and features; G = GEO + L C. In float32 [D9]."""
+    hidden layer over xyz and features; G = GEO + L C. In float32 [D9]. The network learns what is
+    to be added to the distance from a small sphere: a surface that starts inside the landmark
+    grows to it, one that starts outside also has to be carved out of the sky."""
     def __init__(self, octree, hidden):
         super().__init__()
         self.octree = octree
         self.features = octree.features.shape[1] * octree.levels  # LC
         self.lin1 = nn.Linear(3 + self.features, hidden)
         self.lin2 = nn.Linear(hidden, 1 + GEO)
+        nn.init.normal_(self.lin2.weight[0], std=0.01)
+        nn.init.zeros_(self.lin2.bias)
         self.taps = constant(*TAPS)  # (5,3)
 
     def forward(self, x):
@@ -524,8 +534,9 @@ class SDFField(nn.Module):
         feat = self.octree(x)  # (P,LC)
         inputs = torch.cat([x, feat], 1)  # (P,3+LC)
         h = F.relu(self.lin1(inputs))  # (P,H)
-        sdf, geo = self.lin2(h).split([1, GEO], 1)  # (P,1), (P,GEO)
-        return sdf[:, 0], torch.cat([geo, feat], 1)
+        change, geo = self.lin2(h).split([1, GEO], 1)  # (P,1), (P,GEO)
+        sdf = x.norm(dim=1) - SPHERE + change[:, 0]  # (P,)
+        return sdf, torch.cat([geo, feat], 1)
 
     def derivatives(self, x, eps):
         """grad s (P,3) and lap s (P,) at x (P,3), from s there and at four taps, eps away."""
@@ -660,8 +671,8 @@ class Background(nn.Module):
     """A small NeRF before the sphere and beyond it, on an octree over contracted space."""
     def __init__(self, points, hidden, per_ray):
         super().__init__()
-        self.octree = Octree(2.0, levels=5)
-        seed_octree(self.octree, contract(points), dense=1, near=3)  # SfM points (K,3)
+        self.octree = Octree(2.0, levels=3, root=32)
+        seed_octree(self.octree, contract(points), dense=0, near=2)  # SfM points (K,3)
         features = self.octree.features.shape[1] * self.octree.levels
         self.density = mlp(3 + features, hidden, 1 + GEO)
         self.color = mlp(GEO + per_ray, hidden, 3)
@@ -747,7 +758,7 @@ def render_rays(model, rays, code, jitter):
         depth=depth,
         end=end,
         normal=normal,
-        e_grad=(grad.norm(dim=1) - 1) ** 2,
+        e_grad=eikonal(grad),
         e_curv=lap.abs() * model.eps * (1 - trans.detach()),  # [D4]
         t=t,
         is_inside=(t1 > t0)[:, 0])
@@ -833,13 +844,20 @@ def gpl_loss(mask, phi):
     return (mask * phi).mean()
 
 
-def transient_loss(logit, error, price):
-    """Teaches M = 1 to rays whose error (R,) exceeds their price (R,), M = 0 to the others. The
-    same M minimises (1 - M) error + M price, but the slope of that vanishes where the sigmoid is
-    flat. [D7]"""
-    is_transient = (error > price).float()
-    weight = (error - price).abs()
-    return F.binary_cross_entropy_with_logits(logit, is_transient, weight)
+def transient_loss(logit, excess):
+    """Teaches M = 1 to rays whose error exceeds their price, by excess (R,), M = 0 to the others.
+    The same M minimises (1 - M) error + M price, but the slope of that vanishes where the sigmoid
+    is flat. [D7]"""
+    is_transient = (excess > 0).float()
+    return F.binary_cross_entropy_with_logits(logit, is_transient, excess.abs())
+
+
+def doubted(mask, excess, done):
+    """M (R,), but 1 where an error above its price (excess (R,) > 0) confirms what the network
+    suspects. A suspicion has to be stronger from step to step, and ends after 30 % of training:
+    at first the scene must not learn to paint people, later it must learn its details. [D7]"""
+    is_confirmed = (excess > 0) & (mask > done / DOUBTED)
+    return torch.where(is_confirmed, 1.0, mask)
 
 
 def follow_quantiles(running, shares, values, is_chosen, rate=0.1):
@@ -851,6 +869,7 @@ def follow_quantiles(running, shares, values, is_chosen, rate=0.1):
     running *= torch.exp(rate * excess)
 
 
+DOUBTED = 0.3  # share of training in which an error of a ray confirms a suspicion of the mask
 LEAST_PRICE = 0.15  # error of a ray below which it is never transient
 TAUGHT = 0.6  # share of training in which the mask learns; later it would give up people
 
@@ -929,8 +948,6 @@ class GeoNVS(nn.Module):
         self.color = nn.Sequential(
             LipschitzLinear(GEO + self.sdf.features + 3 + 9 + A, cfg.hidden),
             nn.ReLU(),
-            LipschitzLinear(cfg.hidden, cfg.hidden),
-            nn.ReLU(),
             LipschitzLinear(cfg.hidden, 3))
         self.appearance = nn.Embedding(len(scene.wh), A)
         self.appearance.requires_grad_(A > 0)
@@ -946,6 +963,7 @@ class GeoNVS(nn.Module):
         self.mask = TransientMask(scene)
         finest = 16 * 2 ** (levels - 1)  # cells along an axis
         self.cache = SDFCache(min(max(finest, 64), 128))
+        self.cache.refresh(self.distance)
         print(f"  {levels} levels, appearance code of {A}, {len(self.octrees)} octrees")
 
     @property
@@ -958,9 +976,10 @@ class GeoNVS(nn.Module):
         """s (P,) at x (P,3)."""
         return self.sdf(x)[0]
 
-    def losses(self, rays, photos, step, gen):
+    def losses(self, rays, photos, done, gen):
         """The objective, Eq. 5, of rays that come photo by photo, equally many of each of photos
-        (B,). Returns the weighted sum; the raw terms by name; what `observe` learns from."""
+        (B,); done: share of training, 0..1. Returns the weighted sum; the raw terms by name; what
+        `observe` learns from."""
         cfg = self.cfg
         R = len(rays.o)
         code = self.appearance(photos).repeat_interleave(R // len(photos), 0)  # (R,A)
@@ -978,23 +997,29 @@ class GeoNVS(nn.Module):
             logit = sample_logits(self.mask.logits(photos), rays.uv)  # (R,)
             mask = logit.detach().sigmoid()
             price = self.mask.price(phi, cfg.lam_mask, cfg.lam_gpl)
-            l_mask = transient_loss(logit, error * ~is_static, price)  # SfM pixels: M = 0 [D10]
+            excess = error * ~is_static - price  # (R,) SfM pixels: M = 0 [D10]
+            if done < TAUGHT:
+                l_mask = transient_loss(logit, excess)
+            mask = doubted(mask, excess, done)
 
         which = random_index(gen, cfg.samples + 1, R)
-        t = out["t"].gather(1, which[:, None])  # (R,1) a random sample of each ray [D13]
-        taps = rays.at(t) + self.eps * self.sdf.taps  # (R,5,3)
-        cube = 2 * uniform(gen, R // 2, 3) - 1
-        sfm = self.sfm[random_index(gen, len(self.sfm), R // 2)]
+        t = out["t"].gather(1, which[:, None])  # (R,1)
+        sample = rays.at(t)[::2]  # (N,1,3) a random one of every second ray [D13]
+        N = len(sample)
+        taps = sample + self.eps * self.sdf.taps  # (N,5,3)
+        cube = 2 * uniform(gen, N, 3) - 1
+        sfm = self.sfm[random_index(gen, len(self.sfm), N)]
         points = torch.cat([taps.flatten(0, 1), cube, sfm])
-        s_taps, s_cube, s_sfm = self.distance(points).split([5 * R, R // 2, R // 2])
-        grad, _ = finite_differences(s_taps.reshape(R, 5), self.sdf.taps, self.eps)
-        e_grad = (grad.norm(dim=1) - 1) ** 2  # (R,)
-        e_grad = (out["e_grad"] + e_grad) / 2
+        s_taps, s_cube, s_sfm = self.distance(points).split([5 * N, N, N])
+        grad, _ = finite_differences(s_taps.reshape(N, 5), self.sdf.taps, self.eps)
+        is_inside = out["is_inside"]
+        eik_end = (is_inside * out["e_grad"]).mean()
+        eik_sample = (is_inside[::2] * eikonal(grad)).mean()
         pull = self.deviation().detach().clamp(max=40)  # [D10]
 
         terms = dict(
             rgb=((1 - mask) * residual.mean(1)).mean(),
-            eik=(out["is_inside"] * e_grad).mean(),
+            eik=(eik_end + eik_sample) / 2,
             curv=out["e_curv"].mean(),  # [D4]
             lps=lipschitz_loss(self.color),
             off=torch.exp(-50 * s_cube.abs()).mean(),
@@ -1013,10 +1038,8 @@ class GeoNVS(nn.Module):
         return total, terms, out
 
     def before_step(self, step, done):
-        """Keeps zeta within its bounds and an eighth of the cache up to date, and ends the mask's
-        lessons. done: 0..1."""
+        """Keeps zeta within its bounds and an eighth of the cache up to date. done: 0..1."""
         self.deviation.bound(done, most=32 * self.cfg.samples)  # about 1 / the finest section
-        self.mask.requires_grad_(done < TAUGHT)
         if step % 8 == 0:
             self.cache.refresh(self.distance, step // 8 % 8, 8)
 
@@ -1051,24 +1074,6 @@ class GeoNVS(nn.Module):
             dict(params=tables, lr=self.cfg.lr_grid),
             dict(params=zeta, lr=1e-3, eps=1e-8),
             dict(params=mask, lr=8e-3)]
-
-    def start(self, gen, steps=200, radius=0.25):
-        """Warm-up: L_sphere = (s(x) - (|x| - radius))^2. A small sphere: a surface that starts
-        inside the landmark grows to it, one that starts outside also has to be carved out of the
-        sky."""
-        grid, *networks = self.sdf.parameters()  # the octree's features come first
-        groups = [
-            dict(params=[grid], lr=1e-3),
-            dict(params=networks, lr=5e-3)]
-        adam = torch.optim.Adam(groups)
-        for _ in range(steps):
-            x = 2 * uniform(gen, 1024, 3) - 1  # (P,3)
-            sphere = x.norm(dim=1) - radius
-            loss = ((self.distance(x) - sphere) ** 2).mean()
-            adam.zero_grad()
-            loss.backward()
-            adam.step()
-        self.cache.refresh(self.distance)
 
     def refine(self, optimizer):
         """Splits and merges cells; Adam's moments move along with their features. [D15]"""
@@ -1190,7 +1195,7 @@ def training_step(model, optimizer, photos, step, done, gen):
     share of training, 0..1. Returns the raw terms of the loss. Never waits for the device."""
     model.before_step(step, done)
     rays, picked = model.batch(photos, model.cfg.rays // RANKS, gen)
-    loss, terms, out = model.losses(rays, picked, step, gen)
+    loss, terms, out = model.losses(rays, picked, done, gen)
     optimizer.zero_grad()
     loss.backward()
     if RANKS > 1:
@@ -1274,7 +1279,6 @@ def train(cfg, scene, run, saved=None, kind=GeoNVS):
     if saved is None:
         for name in RESULTS:  # nothing of a former run may be taken for this one's
             (run / name).unlink(missing_ok=True)
-        model.start(gen)
         optimizer = make_optimizer(model)
         state = dict(step=0, refined=0, seconds=0.0, joules=0.0)
     else:
@@ -1462,58 +1466,37 @@ def evaluate(model, scene, lpips=None):
 
 @torch.no_grad()
 def toy_truth(model, scene):
-    """What only a toy can tell, at training pixels. sdf_error: mean |s - s_true| within 0.05 of
-    visible surfaces, scene units; normal_error: median angle at walls, degrees, by taps of 0.004.
-    mask_iou, mask_static: M > 0.5 against the true occluders, and mean M on all others; None
-    without a mask."""
+    """What only a toy can tell. sdf_error: mean |s - s_true| near visible walls, scene units;
+    normal_error: median angle at walls, degrees, by taps of 0.004. mask_iou, mask_static: M > 0.5
+    against the true occluders of training photos, and mean M on all other pixels; None without a
+    mask."""
     raw = scene.raw
-    walls = []
-    masks = []
-    people = []
-    for photo in scene.photos(False).tolist():
-        rays = photo_rays(scene, photo)
-        pixels = slice(*raw["start"][photo:photo + 2])
-        depth = torch.as_tensor(raw["depth"][pixels]).to(rays.d)  # (R,) infinite for the sky
-        walls.append(rays.at(depth[:, None])[:, 0])
-        logits = model.mask.logits([photo])
-        masks.append(sample_logits(logits, rays.uv).sigmoid())
-        people.append(raw["occluder"][pixels])
-    wall = torch.cat(walls)[::9]  # (P,3)
-    wall = wall[wall.norm(dim=1) < 0.95]
-
-    def true_sdf(x):  # (P,3) -> (P,)
-        world = x.cpu().numpy() * raw["scale"] + raw["center"]
-        s = data_prep.toy_sdf(world, scene.info["background"], scene.info["landmark"])
-        return torch.as_tensor(s / raw["scale"]).to(x)
-
-    gen = torch.Generator().manual_seed(0)
-    noise = torch.randn(wall.shape, generator=gen).to(wall)
-    x = wall + 0.02 * noise
-    true = true_sdf(x)
-    error = (in_chunks(model.distance, x) - true).abs()
-    error = error[true.abs() < 0.05]
-
-    eps = 0.004
-    taps = model.sdf.taps
-    ends = [true_sdf(wall + eps * tap) for tap in taps]
-    true, _ = finite_differences(torch.stack(ends, 1), taps, eps)
-    grad, _ = model.sdf.derivatives(wall, eps)
-    is_smooth = (true.norm(dim=1) - 1).abs() < 0.01  # not at edges
-    cos = F.cosine_similarity(grad, true)[is_smooth].clamp(-1, 1)
+    names = ("near_wall", "near_wall_sdf", "wall", "wall_normal")
+    near, sdf, wall, normal = [torch.as_tensor(raw[name]).to(scene.c2w) for name in names]
+    error = (in_chunks(model.distance, near) - sdf).abs()
+    grad, _ = model.sdf.derivatives(wall, 0.004)
+    cos = F.cosine_similarity(grad, normal).clamp(-1, 1)
     truth = dict(
         sdf_error=error.mean().item(),
         normal_error=cos.acos().rad2deg().median().item(),
         mask_iou=None,
         mask_static=None)
-    if model.cfg.mask != "off":
-        mask = torch.cat(masks).cpu().numpy()
-        people = np.concatenate(people)
+    if model.cfg.mask == "off":
+        return truth
+    masks = []
+    people = []
+    for photo in scene.photos(False).tolist():
+        logits = model.mask.logits([photo])
+        M = sample_logits(logits, photo_rays(scene, photo).uv).sigmoid()
+        masks.append(M.cpu().numpy())
+        pixels = slice(*raw["start"][photo:photo + 2])
+        people.append(raw["occluder"][pixels])
+    mask = np.concatenate(masks)
+    people = np.concatenate(people)
+    truth["mask_static"] = float(mask[~people].mean())
+    if people.any():
         found = mask > 0.5
-        truth["mask_static"] = float(mask[~people].mean())
-        if people.any():
-            both = (found & people).sum()
-            either = (found | people).sum()
-            truth["mask_iou"] = float(both / either)
+        truth["mask_iou"] = float((found & people).sum() / (found | people).sum())
     return truth
 
 
@@ -1770,7 +1753,9 @@ def main(argv=None):
     from_first_process(None)  # the others wait for it
     scene = load_scene(data_prep.open_scene(cfg.source, cfg.downscale), device)
     if render:
-        model, _ = restore(saved, path, cfg, scene, torch.Generator(device))
+        with device:
+            model = GeoNVS(cfg, scene)
+        restore(saved, path, model, torch.Generator(device))
         film(model, scene, run / "film.mp4")
     else:
         execute(cfg, scene, run, saved)
