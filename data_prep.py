@@ -10,25 +10,23 @@ never a z-depth. Functions raise UserError, one sentence that says what to do.
 """
 import argparse
 import gzip
-import http.client
 import inspect
 import io
 import itertools
 import json
-import math
 import os
+import re
 import shutil
 import struct
 import sys
 import tarfile
 import tempfile
 import time
-import urllib.request
 import zipfile
 import zlib
-from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
+from urllib.request import Request, urlopen
 
 import cv2
 import numpy as np
@@ -43,6 +41,7 @@ SCENES = {
     "trevi": ("trevi_fountain", "trevi.tsv"),
     "taj": ("taj_mahal", "taj_mahal.tsv"),
 }
+DATA = Path("data")
 ARCHIVE_URL = "https://www.cs.ubc.ca/research/kmyi_data/imw2020/TrainingData/"
 SPLIT_URL = "https://nerf-w.github.io/data/selected_images/"
 # A scene is one .npz of these arrays: I photos, J = I + 1, N pixels, K points, T observations. A
@@ -87,7 +86,8 @@ def warn(message):
 def progress(items, what):
     """Yields items; says how far it is once that took ten seconds, or a minute in a log file."""
     is_terminal = sys.stdout.isatty()
-    due, wait = (10, 1) if is_terminal else (60, 60)   # seconds
+    wait = 1 if is_terminal else 60   # seconds
+    due = max(10, wait)
     begin = time.monotonic()
     total = len(items)
     for done, item in enumerate(items, 1):
@@ -98,9 +98,8 @@ def progress(items, what):
             due = past + wait
             line = f"  {what}: {done} of {total}, {past / done * (total - done):.0f} s left "
             if is_terminal:
-                print("\r" + line, end="\n" if is_last else "", flush=True)
-            else:
-                print(line, flush=True)
+                line = "\r" + line   # over the one before
+            print(line, end="" if is_terminal and not is_last else "\n", flush=True)
 
 
 def atomic_write(path, write):
@@ -114,8 +113,7 @@ def atomic_write(path, write):
     except OSError as e:
         raise UserError(f"cannot write {path} ({e.strerror or e}): free or choose a place") from e
     finally:
-        if part.exists():
-            part.unlink()
+        part.unlink(missing_ok=True)
 
 
 def write_scene(path, scene):
@@ -134,17 +132,19 @@ def refuse_bomb(path):
 def check_scene(scene):
     """UserError unless the arrays fit FORMAT and each other."""
     start, wh = scene["start"], scene["wh"]
-    tracks = array([scene["track_photo"], scene["track_point"]])
-    counts = len(wh), len(scene["points"])
-    sizes = dict(zip("IJKTN", (len(wh), len(wh) + 1, counts[1], len(tracks[0]), start[-1])))
+    photos, points = len(wh), len(scene["points"])
+    tracks = scene["track_photo"], scene["track_point"]
+    sizes = {"2": 2, "3": 3, "4": 4, "I": photos, "J": photos + 1, "K": points}
+    sizes.update(N=start[-1], T=len(tracks[0]))
     for key, text in FORMAT.items():
         value = scene[key]
         dtype, _, letters = text.partition(" ")
-        shape = tuple(sizes.get(letter) or int(letter) for letter in letters)
+        shape = tuple(sizes[letter] for letter in letters)
         check(value.shape == shape and str(value.dtype).startswith(dtype), key)
-        check(dtype[0] != "f" or key == "bg_color" or np.isfinite(value).all(), key)
-    check(start[0] == 0 and (wh > 0).all() and (np.diff(start) == wh.prod(1)).all(), "start")
-    check(tracks.min() >= 0 and (tracks.max(1) < counts).all(), "tracks")
+        if dtype.startswith("float") and key != "bg_color":
+            check(np.isfinite(value).all(), key)
+    np.ravel_multi_index(tracks, (photos, points))   # ValueError if any is out of range
+    check(wh.min() > 0 and np.array_equal(start, np.cumsum([0, *wh.prod(1)])), "start")
     check(min(scene["footprint"], scene["scale"]) > 0 and not scene["is_test"].all(), "scale")
     info = json.loads(str(scene["info"]))
     check({"kind", "scene", "downscale", "folder", "split"} <= set(info), "info")
@@ -155,7 +155,7 @@ def read_scene(path):
     try:
         refuse_bomb(path)
         with np.load(path, allow_pickle=False) as file:
-            scene = {key: file[key] for key in file.files}
+            scene = dict(file)
         check_scene(scene)
     except Exception as e:   # a damaged file can fail in any layer: zip, array header, dtype, text
         raise UserError(f"{path} is no whole scene, or too large: delete it, it is remade") from e
@@ -165,75 +165,90 @@ def read_scene(path):
 # ---- the toy: z up, front towards -y, in its own units; world = TOY_SCALE * x + TOY_ORIGIN -------
 TOY_SCALE = 3.7
 TOY_ORIGIN = array([12.0, -7.0, 5.0])
-SUN = array([-.50, -.62, .60]) / norm([-.50, -.62, .60])   # left, behind the tourists
+SUN = array([-.50, -.62, .60])   # left, behind the tourists
+SUN /= norm(SUN)
 STONE, PALE, SAND, BRICK, ROOF, SLATE, COPPER, GOLD, HOUSE, LEAF, PAVING, MEADOW = range(12)
-# Percent: colour, width and height of a cell, contrast of cells, has windows; a row a surface.
-LOOKS = array("""
-    50 46 40  29 13  20   0
-    80 74 60  29 13   8   0
-    78 56 30  30 30  15 100
-    52 19 11  30 30  15 100
-    60 22 12  16  8  30   0
-    12 19 31  20 10  25   0
-    16 46 36  50 50  40   0
-    90 58  8  50 50   0   0
-    60 46 34  62 62  15 100
-    10 22  5  20 20  45   0
-    48 42 34  42 42  20   0
-    17 22  8  60 60  10   0
-""".split(), float).reshape(-1, 7) / 100
-# Shape; centre x y z, half height, radius at the bottom and at the top, depth in thousandths; look.
-# Shape 1 is a box or roof, |x| <= radius and |y| <= depth; 2 a column or cone; 3 a ball. Plinth,
-# columns, hall; dome; tower; annex; statue.
-LANDMARK = array("""
-    1  -10  -30   50   50  960  960  530  0
-    1  -50    0  150   50  850  850  470  0
-    2    0 -340  470  270   62   50  inf  1
-    2    0 -340  470  270   62   50  inf  1
-    2    0 -340  470  270   62   50  inf  1
-    2    0 -340  470  270   62   50  inf  1
-    2    0 -340  470  270   62   50  inf  1
-    2    0 -340  470  270   62   50  inf  1
-    1   30  200  530  330  590  590  260  2
-    1   30   30  800   60  670  670  460  1
-    1   30   30  980  120  710    0  480  4
-    2  -50  220 1070  170  330  310  inf  2
-    3  -50  220 1240  300  300  300  inf  6
-    2  -50  220 1570   70   75   65  inf  1
-    2  -50  220 1700   60  100   20  inf  6
-    3  -50  220 1780   45   45   45  inf  7
-    1  870  180  530  530  170  170  170  3
-    1  870  180 1100   40  200  200  200  1
-    2  870  180 1320  180  200    0  inf  5
-    1 -760  240  380  180  190  190  250  3
-    1 -760  240  650   90  230    0  280  5
-    1 -800 -350  280   80   90   90   90  1
-    2 -800 -350  480  120   70   40  inf  6
-    3 -800 -350  640   55   55   55  inf  6
-""".split(), float).reshape(-1, 9) / (1, *[1000] * 7, 1)
+
+
+def table(text):
+    """The numbers of a text, a row a line."""
+    return np.loadtxt(io.StringIO(text))
+
+
+# Colour, width and height of a cell, contrast of cells, has windows; a row a surface.
+LOOKS = table("""
+     .5  .46   .4  .29  .13   .2  0
+     .8  .74   .6  .29  .13  .08  0
+    .78  .56   .3   .3   .3  .15  1
+    .52  .19  .11   .3   .3  .15  1
+     .6  .22  .12  .16  .08   .3  0
+    .12  .19  .31   .2   .1  .25  0
+    .16  .46  .36   .5   .5   .4  0
+     .9  .58  .08   .5   .5    0  0
+     .6  .46  .34  .62  .62  .15  1
+     .1  .22  .05   .2   .2  .45  0
+    .48  .42  .34  .42  .42   .2  0
+    .17  .22  .08   .6   .6   .1  0
+""")
+# Shape; centre x y z, half height, radius at the bottom and at the top, depth; look.
+# Shape 1 is a box or roof, |x| <= radius and |y| <= depth; 2 a column or cone; 3 a ball; 0 the
+# ground, z < 0. Plinth, columns, hall; dome; tower; annex; statue.
+LANDMARK = table("""
+    1  -.01  -.03   .05   .05   .96   .96   .53  0
+    1  -.05     0   .15   .05   .85   .85   .47  0
+    2     0  -.34   .47   .27  .062   .05  .062  1
+    2     0  -.34   .47   .27  .062   .05  .062  1
+    2     0  -.34   .47   .27  .062   .05  .062  1
+    2     0  -.34   .47   .27  .062   .05  .062  1
+    2     0  -.34   .47   .27  .062   .05  .062  1
+    2     0  -.34   .47   .27  .062   .05  .062  1
+    1   .03    .2   .53   .33   .59   .59   .26  2
+    1   .03   .03    .8   .06   .67   .67   .46  1
+    1   .03   .03   .98   .12   .71     0   .48  4
+    2  -.05   .22  1.07   .17   .33   .31   .33  2
+    3  -.05   .22  1.24    .3    .3    .3    .3  6
+    2  -.05   .22  1.57   .07  .075  .065  .075  1
+    2  -.05   .22   1.7   .06    .1   .02    .1  6
+    3  -.05   .22  1.78  .045  .045  .045  .045  7
+    1   .87   .18   .53   .53   .17   .17   .17  3
+    1   .87   .18   1.1   .04    .2    .2    .2  1
+    2   .87   .18  1.32   .18    .2     0    .2  5
+    1  -.76   .24   .38   .18   .19   .19   .25  3
+    1  -.76   .24   .65   .09   .23     0   .28  5
+    1   -.8  -.35   .28   .08   .09   .09   .09  1
+    2   -.8  -.35   .48   .12   .07   .04   .07  6
+    3   -.8  -.35   .64  .055  .055  .055  .055  6
+""")
 LANDMARK[2:8, 1] = np.linspace(-.54, .60, 6)   # the columns stand in a row
 GROUPS = (2, 16), (11, 16), (16, 19), (19, 21), (21, 24)   # on the plinth; of it the dome; ...
-HOUSES = array("""
-    -7.5 2.0 .6 1.5
-    -6.2 4.4 .5 1.1
-    -4.0 6.4 .8 1.8
-    -1.2 7.6 .5 2.3
-     2.0 6.8 .7 1.4
-     4.6 5.6 .5 1.9
-     6.8 3.0 .6 1.3
-     7.4 0.0 .5 1.7
-""".split(), float).reshape(-1, 4)   # x, y, half width, height
-
-
-def town():
-    """Parts of the background: houses with a roof, and a tree before each."""
-    parts = []
-    for x, y, w, h in HOUSES:
-        tree = .8 * w
-        parts.append((1, x, y, h / 2, h / 2, w, w, w, HOUSE))
-        parts.append((1, x, y, h + .25, .25, w, 0, w, SLATE))
-        parts.append((3, .8 * x + 1, .7 * y, .2 + tree, tree, tree, tree, inf, LEAF))
-    return array(parts)
+# The background: the ground, and houses, each with a roof and a tree before it.
+TOWN = table("""
+    0      0     0     0     1    1    1    1  10
+    1   -7.5     2   .75   .75   .6   .6   .6   8
+    1   -7.5     2  1.75   .25   .6    0   .6   5
+    3     -5   1.4   .68   .48  .48  .48  .48   9
+    1   -6.2   4.4   .55   .55   .5   .5   .5   8
+    1   -6.2   4.4  1.35   .25   .5    0   .5   5
+    3  -3.96  3.08    .6    .4   .4   .4   .4   9
+    1     -4   6.4    .9    .9   .8   .8   .8   8
+    1     -4   6.4  2.05   .25   .8    0   .8   5
+    3   -2.2  4.48   .84   .64  .64  .64  .64   9
+    1   -1.2   7.6  1.15  1.15   .5   .5   .5   8
+    1   -1.2   7.6  2.55   .25   .5    0   .5   5
+    3    .04  5.32    .6    .4   .4   .4   .4   9
+    1      2   6.8    .7    .7   .7   .7   .7   8
+    1      2   6.8  1.65   .25   .7    0   .7   5
+    3    2.6  4.76   .76   .56  .56  .56  .56   9
+    1    4.6   5.6   .95   .95   .5   .5   .5   8
+    1    4.6   5.6  2.15   .25   .5    0   .5   5
+    3   4.68  3.92    .6    .4   .4   .4   .4   9
+    1    6.8     3   .65   .65   .6   .6   .6   8
+    1    6.8     3  1.55   .25   .6    0   .6   5
+    3   6.44   2.1   .68   .48  .48  .48  .48   9
+    1    7.4     0   .85   .85   .5   .5   .5   8
+    1    7.4     0  1.95   .25   .5    0   .5   5
+    3   6.92     0    .6    .4   .4   .4   .4   9
+""")
 
 
 def toy_parts(landmark, background):
@@ -245,8 +260,8 @@ def toy_parts(landmark, background):
             group = parts[first:last]
             place = group[:, 1:4]
             size = rng.uniform(.7, 1.2, 3)
-            shift = np.append(rng.uniform(-.06, .06, 2), 0)
-            foot = np.append(place[:, :2].mean(0), place[0, 2] - group[0, 4])
+            shift = *rng.uniform(-.06, .06, 2), 0
+            foot = *place[:, :2].mean(0), place[0, 2] - group[0, 4]
             place[:] = foot + (place - foot) * size + shift
             is_box = group[:, :1] == 1   # others stay round
             group[:, 4:8] *= where(is_box, size[[2, 0, 0, 1]], size[2])
@@ -254,7 +269,7 @@ def toy_parts(landmark, background):
         looks = [*rng.permutation(2), *SAND + rng.permutation(2), *ROOF + rng.permutation(3), GOLD]
         parts[:, 8] = np.take(looks, parts[:, 8].astype(int))
     if background:
-        parts = concatenate([parts, town()])
+        parts = concatenate([parts, TOWN])
     return parts
 
 
@@ -263,26 +278,27 @@ def part_sdf(part, x):
     shape, _, _, _, half, bottom, top, depth, _ = part.T
     x, y, z = (x - part[..., 1:4]).T
     u = where(shape == 1, abs(x), hypot(x, y))
-    # In the plane of u and z: the slanted side from bottom to top, and the caps.
+    # In the plane of u and z: from the slanted side, which goes from bottom to top, and the caps.
     grow = top - bottom
     tall = 2 * half
     k = ((u - bottom) * grow + (z + half) * tall) / (grow ** 2 + tall ** 2)
     k = clip(k, 0, 1)
-    side = hypot(u - bottom - k * grow, z + half - k * tall)
-    cap = hypot(maximum(u - where(z < 0, bottom, top), 0), abs(z) - half)
-    inside = (abs(z) < half) & (u < bottom + grow * (z + half) / tall)
-    d = where(inside, -1, 1) * minimum(side, cap)
-    e = abs(y) - depth   # -inf for a column
+    side_u = u - bottom - k * grow
+    side_z = z + half - k * tall
+    cap_u = maximum(u - where(z < 0, bottom, top), 0)
+    cap_z = abs(z) - half
+    is_inside = (side_u < 0) & (cap_z < 0)
+    d = where(is_inside, -1, 1) * minimum(hypot(side_u, side_z), hypot(cap_u, cap_z))
+    e = where(shape == 1, abs(y) - depth, -inf)
     d = hypot(maximum(d, 0), maximum(e, 0)) + minimum(maximum(d, e), 0)
-    return where(shape == 3, hypot(u, z) - bottom, d)
+    d = where(shape == 3, hypot(u, z) - bottom, d)
+    return where(shape == 0, z, d)
 
 
 def toy_sdf(x_world, background=True, landmark=0):
     """Signed distance of the toy, + and exact outside, SfM units. (P,3) -> (P,) float64"""
-    x = (np.asarray(x_world, np.float64) - TOY_ORIGIN) / TOY_SCALE
+    x = (x_world - TOY_ORIGIN) / TOY_SCALE
     distances = [part_sdf(part, x) for part in toy_parts(landmark, background)]
-    if background:
-        distances.append(x[:, 2])   # the ground
     return np.min(distances, axis=0) * TOY_SCALE
 
 
@@ -292,13 +308,16 @@ def enter_part(part, o, d):
     A part is where a quadric and up to two slabs overlap: a ray is inside between the last
     entrance and the first exit."""
     shape, *_, half, bottom, top, depth, _ = part
+    if shape == 0:
+        return where(d[:, 2] < -1e-3, -o[:, 2] / d[:, 2], inf)
     n = int(shape)   # the quadric is round in the first n coordinates
+    flat_o, flat_d = o[:, :n], d[:, :n]
     grow = (top - bottom) / half / 2
     rise = grow * d[:, 2]
     w = (bottom + top) / 2 + grow * o[:, 2]   # radius at the ray's start
-    a = (d[:, :n] ** 2).sum(1) - rise ** 2
-    b = (d[:, :n] * o[:, :n]).sum(1) - rise * w
-    c = (o[:, :n] ** 2).sum(1) - w * w
+    a = (flat_d ** 2).sum(1) - rise ** 2
+    b = (flat_d * flat_o).sum(1) - rise * w
+    c = (flat_o ** 2).sum(1) - w * w
     root = np.sqrt(b * b - a * c)   # nan for a miss
     is_cone = a < 0   # such a ray is inside on one end, for ever
     enter = where(is_cone & (rise < 0), -inf, (-b - root) / a)
@@ -312,116 +331,107 @@ def enter_part(part, o, d):
 
 
 @np.errstate(divide="ignore", invalid="ignore")
-def trace(o, d, parts, ground):
-    """First hits of rays: distance (R,), inf is sky, and part (R,), -1 is the ground."""
-    t = where(ground & (d[:, 2] < -1e-3), -o[:, 2] / d[:, 2], inf)   # (R,)
-    which = np.full(len(d), -1)
-    centre = parts[:, 1:4]
-    along = centre @ d.T - (o * d).sum(1)   # (P,R)
-    aside = (centre ** 2).sum(1)[:, None] - 2 * centre @ o.T + (o * o).sum(1) - along ** 2
-    for i, (shape, *_, half, bottom, top, depth, _) in enumerate(parts):
-        extent = max(bottom, top), half * (shape < 3), depth if shape == 1 else 0
-        radius = norm(extent)   # of the bounding sphere
-        rows = flatnonzero((aside[i] < radius ** 2) & (abs(along[i]) < radius + t))
-        enter = enter_part(parts[i], o[rows] - centre[i], d[rows])
-        hit = enter < t[rows]
-        t[rows[hit]] = enter[hit]
-        which[rows[hit]] = i
-    return t, which
+def trace(o, d, parts):
+    """First hits of rays from o (R,3) or (1,3) along d, the same: distance (R,), inf is sky, and
+    number of the part (R,)"""
+    enter = stack([enter_part(part, o - part[1:4], d) for part in parts])
+    return enter.min(0), enter.argmin(0)
 
 
 # Two ranges of hills: base and size as slopes, waves around the horizon, colour.
-HILLS = array("""
+HILLS = table("""
     .11 .045 5 .25 .33 .45
     .06 .03  9 .11 .18 .16
-""".split(), float).reshape(-1, 6)
+""")
 
 
 def sky(d):
     """Radiance of the sky and two ranges of hills. d (R,3) -> (R,3) linear"""
     up = d[:, 2:]
     azimuth = np.arctan2(d[:, :1], d[:, 1:2])
-    colour = (.58, .68, .78) + clip(up * 1.5, 0, 1) * (-.52, -.46, -.26)
+    colour = (.58, .68, .78) - clip(up * 1.5, 0, 1) * (.52, .46, .26)
     for base, size, waves, *hill in HILLS:
         ridge = sin(waves * azimuth + base * 40) + 0.6 * sin(2.3 * waves * azimuth)
         colour = where(up < base + size * ridge, hill, colour)
     return colour
 
 
-def paint(x, part, is_ground):
+def paint(x, part):
     """Solid texture of cells at points of the surface: x (H,3), part (H,9) -> (H,3)"""
     x, y, z = x.T
     shape, centre_x, centre_y = part.T[:3]
-    square = where(hypot(x, y) < 2.6, PAVING, MEADOW)
-    look = LOOKS[where(is_ground, square, part[:, 8]).astype(int)]
+    is_ground = shape == 0
+    is_meadow = is_ground & (hypot(x, y) >= 2.6)
+    look = LOOKS[where(is_meadow, MEADOW, part[:, 8]).astype(int)]
     width, height, contrast, windows = look.T[3:]
     turn = np.arctan2(y - centre_y, x - centre_x)
     across = where(is_ground, x, where(shape == 1, x + y, turn))
     row = where(is_ground, y, z) / height
-    bond = (floor(row) % 2 / 2) * (1 - windows)   # every other row of stones is shifted
+    bond = floor(row) % 2 / 2 * (1 - windows)   # every other row of stones is shifted
     column = across / width + bond
     chance = abs(sin(12.9898 * floor(column) + 78.233 * floor(row))) * 437.585 % 1
     is_window = (abs(column % 1 - .5) < .2) * (abs(row % 1 - .45) < .28)
-    brightness = (1 + contrast * (2 * chance - 1)) * (1 - .8 * (windows * is_window))
+    brightness = (1 + contrast * (2 * chance - 1)) * (1 - .8 * windows * is_window)
     return look[:, :3] * brightness[:, None]
 
 
 def shade(o, d, parts, background, sun):
-    """Radiance along rays: sun, shadow, sky light and haze. o, d (R,3), sun (3,) -> (R,3) linear"""
+    """Radiance along rays: sun, shadow, sky light and haze. o as in trace, sun (3,) -> (R,3)"""
     colour = sky(d) * background
-    t, which = trace(o, d, parts, background)
+    t, which = trace(o, d, parts)
     hit = flatnonzero(t < inf)
-    x = o[hit] + t[hit, None] * d[hit]
+    x = np.broadcast_to(o, d.shape)[hit] + t[hit, None] * d[hit]
     part = parts[which[hit]]   # (H,9)
-    is_ground = which[hit] < 0
     steps = 1e-5 * eye(3)
     normal = stack([part_sdf(part, x + e) - part_sdf(part, x - e) for e in steps], 1) / 2e-5
-    normal = where(is_ground[:, None], (0, 0, 1), normal)
-    to_sun = np.broadcast_to(sun, x.shape)
-    in_sun = trace(x + 1e-4 * normal, to_sun, parts, background)[0] == inf
-    light = (clip(normal @ sun, 0, None) * in_sun)[:, None] * (1.15, 1.05, .88)
+    in_sun = trace(x + 1e-4 * normal, sun[None], parts)[0] == inf
+    light = (maximum(normal @ sun, 0) * in_sun)[:, None] * (1.15, 1.05, .88)
     light += (0.20 + 0.10 * normal[:, 2:]) * (.8, .92, 1.15)
     haze = np.exp(-maximum(t[hit, None] - 5, 0) / 20)
-    colour[hit] = haze * paint(x, part, is_ground) * light + (1 - haze) * (.42, .50, .58)
+    colour[hit] = haze * paint(x, part) * light + (1 - haze) * (.42, .50, .58)
     return colour
 
 
 def rays(K, c2w, w, h, dx=0.5, dy=0.5):
     """Unit directions of a photo's pixels in world axes, row by row. -> (h*w,3)"""
     v, u = np.mgrid[:h, :w].reshape(2, -1)
-    d = stack([(u + dx - K[2]) / K[0], (v + dy - K[3]) / K[1], np.ones(w * h)], 1)
-    return (d / norm(d, axis=1, keepdims=True)) @ c2w[:, :3].T
+    d = np.ones((w * h, 3))
+    d[:, :2] = (stack([u + dx, v + dy], 1) - K[2:]) / K[:2]
+    d /= norm(d, axis=1, keepdims=True)
+    return d @ c2w[:, :3].T
 
 
 def project(K, c2w, x):
     """Pixels (P,2), -1e9 behind the camera, and distances (P,) of points x (P,3)."""
     p = (x - c2w[:, 3]) @ c2w[:, :3]
-    z = where(p[:, 2:] > 1 / FAR, p[:, 2:], np.nan)
-    uv = p[:, :2] / z * K[:2] + K[2:]
-    return np.nan_to_num(uv, nan=-1e9), norm(p, axis=1)
+    z = p[:, 2:]
+    uv = p[:, :2] / maximum(z, 1 / FAR) * K[:2] + K[2:]
+    return where(z > 0, uv, -1e9), norm(p, axis=1)
 
 
 def toy_camera(rng, azimuth, size):
     """A tourist at `azimuth` [rad] from the front. -> K (4,), c2w (3,4) in the toy's units, w, h"""
     aspect = rng.choice([4 / 3, 3 / 2, 1.1, 3 / 4, 2 / 3])
-    w, h = np.round(size * minimum((aspect, 1), (1, 1 / aspect))).astype(int)
+    w = round(size * min(1, aspect))
+    h = round(size * min(1, 1 / aspect))
     angle = radians(rng.uniform(40, 65))   # of view, along the long side
     f = size / 2 / np.tan(angle / 2)
     target = (0, .05, .80) + rng.uniform(-.12, .12, 3)
     away = array([sin(azimuth), -np.cos(azimuth), rng.uniform(-.15, .45)])
     away = away * f / min(w, h) * rng.uniform(2.0, 2.6)
-    eye = target + away * rng.choice((0.8, 1), p=(.1, .9))
-    eye[2] = max(eye[2], 0.2)
-    z = (target - eye) / norm(target - eye)
+    place = target + away * rng.choice((0.8, 1), p=(.1, .9))
+    place[2] = max(place[2], 0.2)
+    z = target - place
+    z /= norm(z)
     lean = rng.normal(0, .03, 2)   # hardly anyone holds it level
     x = cross(z, (*lean, 1))
     x /= norm(x)
-    c2w = stack([x, cross(z, x), z, eye], 1)
+    c2w = stack([x, cross(z, x), z, place], 1)
     return array([f, f, w / 2, h / 2]), c2w, w, h
 
 
 # Legs, belts of the coat and head: both ends x y and width, in heights above the feet.
-STROKES = array("""
+STROKES = table("""
     -.06 .03 -.06 .45 .10
      .06 .03  .06 .45 .10
     -.05 .50  .05 .50 .16
@@ -430,7 +440,7 @@ STROKES = array("""
     -.05 .68  .05 .68 .16
     -.05 .74  .05 .74 .16
       0  .92   0  .92 .15
-""".split(), float).reshape(-1, 5)
+""")
 
 
 def draw_people(rng, w, h, share):
@@ -458,15 +468,16 @@ def draw_people(rng, w, h, share):
     return small.reshape(-1, 4).astype(float)
 
 
-def toy_points(rng, views, depths, people, count=3000):
+def toy_points(rng, views, depths, people):
     """As by SfM: noisy, 1.5 % wrong. -> points (K,5) as in finish, and those (M,) of each photo"""
     x, tracks = [], []
     photos = list(zip(views, depths, people))
+    count = 3000 // len(photos)
     for (K, c2w, w, h), depth, hidden in photos:
         surface = c2w[:, 3] + rays(K, c2w, w, h) * depth[:, None]
         ok = (depth < 30) & ~hidden
-        on = ok & (surface[:, 2] > .02) & (abs(surface[:, :2]) < 1.3).all(1)   # the landmark
-        for some, n in (on, count // len(views)), (ok & ~on, count // 5 // len(views)):
+        on = ok & (abs(surface - (0, 0, 1.02)) < (1.3, 1.3, 1)).all(1)   # the landmark
+        for some, n in (on, count), (ok & ~on, count // 5):
             x.append(surface[rng.choice(flatnonzero(some), n * some.any())])
     x = concatenate(x)
     for (K, c2w, w, h), depth, hidden in photos:
@@ -487,7 +498,7 @@ def shake_camera(rng, K, c2w, pixels):
     """Moves c2w, in the toy's units, by noise that is `pixels` rms at the landmark."""
     *turn, dx, dy = rng.normal(0, pixels / 2, 4) / K[0]   # half by turning, half by moving [rad]
     c2w[:, 3] += c2w[:, :2] @ (dx, dy) * norm(c2w[:, 3])
-    c2w[:, :3] = c2w[:, :3] @ cv2.Rodrigues(array([*turn, 0]))[0]
+    c2w[:, :3] @= cv2.Rodrigues(array([*turn, 0]))[0]
 
 
 def make_toy(seed=0, size=96, photos=48, test=8, occluders=0.05, exposure=1.0, pose_noise=0.0,
@@ -500,44 +511,44 @@ def make_toy(seed=0, size=96, photos=48, test=8, occluders=0.05, exposure=1.0, p
     info = dict(locals(), scene="toy", kind="toy", downscale=1, folder=None, split=None)
     is_sound = occluders <= 0.6 and exposure <= 2 and sun <= 180 and pose_noise < inf
     is_sound &= min(seed, test, occluders, exposure, pose_noise, landmark, sun) >= 0
-    check(is_sound and size >= 16 and photos >= 4, "the toy needs occluders in 0..0.6, exposure in "
-          "0..2, sun in 0..180, size >= 16, photos >= 4, and no other number below 0")
-    streams = [np.random.default_rng([seed, k]) for k in range(6)]   # no knob moves another
-    camera, taste, people, sfm, shake, day = streams
+    check(is_sound and size >= 16 and photos >= 4,
+          "occluders in 0..0.6, exposure 0..2, sun 0..180, size >= 16, photos >= 4, others >= 0")
+    # No knob changes another's random numbers.
+    camera, taste, people, sfm, shake, day = [np.random.default_rng([seed, k]) for k in range(6)]
     count = photos + test
     angles = 200 * (arange(count) + camera.uniform(.1, .9, count)) / count - 100
     views = [toy_camera(camera, angle, size) for angle in radians(angles)]
-    is_test = np.isin(arange(count), (arange(test) + 0.5) * count // max(test, 1))
+    is_test = np.isin(arange(count), (arange(test) + 0.5) * count // test)
     share = people.gamma(0.8 + 6 * occluders, size=count) * ~is_test   # some photos stay free
     share = minimum(share / share.sum() * photos * occluders, 0.85)
     turns = radians(day.uniform(-sun, sun, count))
-    suns = [cv2.Rodrigues(array([0, 0, turn]))[0] @ SUN for turn in turns]
     parts = toy_parts(landmark, background)
     depth, images, occluder = [], [], []
     for i in progress(range(count), "drawing photos"):
         K, c2w, w, h = views[i]
-        o = np.broadcast_to(c2w[:, 3], (w * h, 3))
-        d = [rays(K, c2w, w, h, *at) for at in itertools.product((.25, .75), repeat=2)]
-        linear = sum(clip(shade(o, to, parts, background, suns[i]), 0, 1) for to in d)
+        o = c2w[None, :, 3]
+        to_sun = cv2.Rodrigues(array([0, 0, turns[i]]))[0] @ SUN
+        linear = 0
+        for dx, dy in itertools.product((.25, .75), repeat=2):   # places in a pixel
+            d = rays(K, c2w, w, h, dx, dy)
+            linear += clip(shade(o, d, parts, background, to_sun), 0, 1) / 4
         cover = draw_people(people, w, h, share[i])
-        linear = linear / 4 * (1 - cover[:, 3:]) + cover[:, :3]   # (h*w,3)
-        tint = exposure * taste.uniform(-1, 1, 4)
-        balance = 1 + .1 * tint[1:3] @ [[1, 0, 0], [0, 0, 1]]   # of red and blue
-        bright = clip(linear * (2 ** (tint[0] / 2) * balance), 0, 1)
-        srgb = bright ** (1.2 ** tint[3] / 2.2)
+        linear = linear * (1 - cover[:, 3:]) + cover[:, :3]   # (h*w,3)
+        brightness, red, blue, contrast = exposure * taste.uniform(-1, 1, 4)
+        gain = 2 ** (brightness / 2) * array([1 + .1 * red, 1, 1 + .1 * blue])
+        srgb = clip(linear * gain, 0, 1) ** (1.2 ** contrast / 2.2)
         images.append((srgb * 255 + 0.5).astype(np.uint8).reshape(h, w, 3))
-        depth.append(trace(o, rays(K, c2w, w, h), parts, background)[0])
+        depth.append(trace(o, rays(K, c2w, w, h), parts)[0])
         occluder.append(cover[:, 3] > 0)
     points, tracks = toy_points(sfm, views, depth, occluder)
     walls = [c2w[:, 3] + rays(K, c2w, w, h) * z[:, None] for (K, c2w, w, h), z in zip(views, depth)]
     for (K, c2w, *_), held_out in zip(views, is_test):
         shake_camera(shake, K, c2w, pose_noise * (not held_out))
         c2w[:, 3] = c2w[:, 3] * TOY_SCALE + TOY_ORIGIN
-    building = parts[:len(LANDMARK)]   # all of it belongs in the unit sphere
-    extent = building[:, [5, 7, 4]]
-    extent = where(extent < inf, extent, building[:, [5]])   # columns and balls are round
-    corners = [building[:, 1:4] + extent * signs for signs in itertools.product((-1, 1), repeat=3)]
-    contain = concatenate(corners) * TOY_SCALE + TOY_ORIGIN
+    building = parts[:len(LANDMARK), None]   # all of it belongs in the unit sphere
+    signs = list(itertools.product((-1, 1), repeat=3))
+    corners = building[..., 1:4] + building[..., [5, 7, 4]] * signs   # (P,8,3)
+    contain = corners * TOY_SCALE + TOY_ORIGIN
     K, c2w, *_ = zip(*views)
     name = [f"toy_{i:03d}.png" for i in range(count)]
     scene = finish(images, K, c2w, is_test, name, points, tracks, info, contain)
@@ -568,20 +579,12 @@ def toy_walls(scene, wall, background, landmark):
 
 
 # ---- from photos, poses and points to a scene ----------------------------------------------------
-def choose_points(points):
-    """Which (K,) of the points are seen often enough and lie exactly enough."""
-    error, views = points[:, 3], points[:, 4]
-    usable = views >= (3 if (views >= 3).sum() >= 500 else 2)
-    check(usable.sum() >= 20, f"{usable.sum()} usable 3D points: SfM needs more overlapping photos")
-    return usable & (error <= quantile(error[usable], 0.95))
-
-
-def find_sphere(x, weight, tracks, is_test, contain=()):
+def find_sphere(x, weight, tracks, is_test, contain):
     """Centre (3,) and radius of what most photos look at; its definition is [D10].
 
     Centre: geometric median of points x (K,3) by weight. Radius: 1.1 x the distance of 95 %; if it
     is a skyline, more than four times the median distance away, only nearer points are counted.
-    Inside are at least 30 % of the points (M,) of most training photos, and contain (P,3)."""
+    Inside are at least 30 % of the points (M,) of most training photos, and contain (...,3)."""
     centre = median(x, axis=0)
     for _ in range(20):   # Weiszfeld
         w = weight / maximum(norm(x - centre, axis=1), 1e-9)
@@ -592,39 +595,39 @@ def find_sphere(x, weight, tracks, is_test, contain=()):
     if quantile(counted, 0.95) > limit:
         counted = counted[counted <= limit]
     radius = 1.1 * quantile(counted, 0.95, method="inverted_cdf")
-    training = [own for own, held_out in zip(tracks, is_test) if len(own) and not held_out]
-    check(training, "no training photo observes a usable 3D point: they do not belong together")
-    reach = median([quantile(distance[own], 0.3) for own in training])
+    reach = [quantile(distance[own], 0.3)
+             for own, held_out in zip(tracks, is_test) if len(own) and not held_out]
+    check(reach, "no training photo observes a usable 3D point: they do not belong together")
     corners = norm(np.reshape(contain, (-1, 3)) - centre, axis=1)
-    radius = max(radius, reach, *1.02 * corners)
+    radius = max(radius, median(reach), *1.02 * corners)
     check(radius > 1 / FAR, "all 3D points coincide: run SfM again")
     return centre, radius
 
 
 def finish(images, K, c2w, is_test, name, points, tracks, info, contain=()):
     """The scene of images (h,w,3), each of which observes the points tracks (M,). SfM units: c2w;
-    points (K,5): x y z, error [px], views; contain (P,3)."""
-    usable = choose_points(points)
-    share = 2e6 / (1 + sum(map(len, tracks)))   # two million observations are plenty
-    rng = np.random.default_rng(0)
+    points (K,5): x y z, error [px], views; contain (...,3)."""
+    error, views = points[:, 3:].T
+    usable = views >= 3
+    if usable.sum() < 500:
+        usable = views >= 2
+    check(usable.sum() >= 20, f"{usable.sum()} usable 3D points: SfM needs more overlapping photos")
+    usable &= error <= quantile(error[usable], 0.95)
     new_index = np.cumsum(usable) - 1
-    kept = []
-    for own in tracks:
-        own = own[usable[own] & (rng.random(len(own)) < share)]
-        kept.append(new_index[own])
+    tracks = [new_index[own[usable[own]]] for own in tracks]
     x = points[usable, :3]
-    weight = minimum(points[usable, 4], 20).astype(int)
-    centre, radius = find_sphere(x, weight, kept, is_test, contain)
+    weight = minimum(views[usable], 20).astype(int)
+    centre, radius = find_sphere(x, weight, tracks, is_test, contain)
     c2w = array(c2w)
     c2w[:, :, 3] = (c2w[:, :, 3] - centre) / radius
+    wh = array([image.shape[1::-1] for image in images])
     arrays = dict(
         rgb=concatenate([image.reshape(-1, 3) for image in images]),
-        wh=[image.shape[1::-1] for image in images],
-        start=np.cumsum([0, *(image.size // 3 for image in images)]),
-        K=K, c2w=c2w, is_test=is_test, name=name, info=json.dumps(info),
+        start=np.cumsum([0, *wh.prod(1)]),
+        wh=wh, K=K, c2w=c2w, is_test=is_test, name=name, info=json.dumps(info),
         points=(x - centre) / radius, center=centre, scale=radius,
-        track_photo=np.repeat(arange(len(c2w)), [len(own) for own in kept]),
-        track_point=concatenate(kept))
+        track_photo=np.repeat(arange(len(wh)), list(map(len, tracks))),
+        track_point=concatenate(tracks))
     scene = {key: np.asarray(value, FORMAT[key].split()[0]) for key, value in arrays.items()}
     return statistics(scene)
 
@@ -635,145 +638,137 @@ def statistics(scene):
     points in the sphere; exposure_spread, deviation of brightness (0..1) at equal points; bg_color
     (3,), beyond the sphere; NaN unless 60 % agree."""
     K, c2w, wh, rgb = scene["K"], scene["c2w"], scene["wh"], scene["rgb"]
-    start = scene["start"]
-    ends = np.searchsorted(scene["track_photo"], arange(1, len(wh)))
-    tracks = np.split(scene["track_point"], ends)
     step = max(1, len(rgb) // 500_000)
     near, places = [], []   # of all photos
     seen, size, bright, beyond = [], [], [], []   # of the training photos
-    for i, own in enumerate(tracks):
-        uv, distance = project(K[i], c2w[i], scene["points"][own].astype(float))
+    for i, first in enumerate(scene["start"][:-1]):
+        own = scene["track_point"][scene["track_photo"] == i]
+        x = scene["points"][own]
+        uv, distance = project(K[i], c2w[i], x)
         places.append(clip(uv / wh[i], -1, 2))
         near.append(max(0.8 * quantile(distance, 0.02), 0.02) if len(own) else 0.05)
         if scene["is_test"][i]:
             continue
         u, v = clip(uv, 0, wh[i] - 1).astype(int).T
         seen.append(own)
-        size.append(distance / K[i, 0])
-        bright.append(rgb[start[i] + v * wh[i, 0] + u].mean(1) / 255)
-        o, d = c2w[i, :, 3], rays(K[i], c2w[i], *wh[i])
+        size.append(distance[norm(x, axis=1) < 1] / K[i, 0])
+        bright.append(rgb[first + v * wh[i, 0] + u].mean(1) / 255)
+        o = c2w[i, :, 3]
+        d = rays(K[i], c2w[i], *wh[i])
         closest = o - minimum(d @ o, 0)[:, None] * d   # to the centre, along each ray
-        misses = norm(closest, axis=1) > 1
-        beyond.append(rgb[start[i]:start[i + 1]][misses][::step])
-    every, size, beyond = concatenate(seen), concatenate(size), concatenate(beyond)
+        misses = flatnonzero(norm(closest, axis=1) > 1)
+        beyond.append(rgb[first + misses[::step]])
+    every = concatenate(seen)
     mean = bincount(every, concatenate(bright)) / maximum(bincount(every), 1)   # (K,)
     offsets = [median(b - mean[own]) for b, own in zip(bright, seen) if len(own)]
+    beyond = concatenate(beyond)
     color = np.full(3, np.nan)
     if len(beyond) > 100:   # fewer may all be people
-        usual = median(beyond, 0)
-        agree = (abs(beyond - usual) < 5.1).all(1)
+        typical = median(beyond, 0)
+        agree = (abs(beyond - typical) < 5.1).all(1)
         if agree.mean() > 0.6:
-            color = usual / 255
-    inside = norm(scene["points"][every], axis=1) < 1
-    size = size[inside] if inside.any() else norm(c2w[:, :, 3], axis=1) / K[:, 0]
-    added = dict(near=np.float32(near), track_uv=concatenate(places, dtype=np.float32))
-    added.update(footprint=quantile(size, 0.25), exposure_spread=np.std(offsets), bg_color=color)
-    return scene | added
+            color = typical / 255
+    return scene | dict(
+        near=np.float32(near),
+        track_uv=concatenate(places, dtype=np.float32),
+        footprint=quantile(concatenate(size), 0.25),
+        exposure_spread=np.std(offsets),
+        bg_color=color)
 
 
 # ---- folders with photos and COLMAP models -------------------------------------------------------
 PHOTO_TYPES = ".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"
 # By COLMAP's number of a camera model: how many numbers it has; and how many focal lengths, which
 # come first, before centre and distortion.
-PARAMETERS = [int(count) for count in "3 4 4 5 8 8 12 5 4 5 12 16 4 5 3 4 6 2".split()]
+PARAMETERS = table("3 4 4 5 8 8 12 5 4 5 12 16 4 5 3 4 6 2").astype(int)
 FOCAL_LENGTHS = {0: 1, 1: 2, 2: 1, 3: 1, 4: 2, 6: 2}   # not of fisheye and other models
 
 
-@dataclass
-class Photo:
-    """A photo as a model has it, in SfM units."""
-    fault: str = ""   # why it cannot be used; then nothing else is known
-    wh: tuple = ()
-    K: np.ndarray = None   # (4,)
-    bend: np.ndarray = None   # k1 k2 p1 p2 k3 .. k6 of OpenCV
-    c2w: np.ndarray = None   # (3,4)
-    points: list = ()   # ids, then rows, of the points that it observes
-
-
 def open_binary(path):
-    """Bounded reader of a little-endian file: read(format) -> values, read(number) -> bytes."""
-    check(path.is_file(), f"{path} is missing: copy the whole COLMAP model, in its binary form")
+    """A function that reads the next values of a little-endian file, by a layout of struct's."""
+    check(path.is_file(),
+          f"{path} is missing: copy the whole model, or for points run colmap point_triangulator")
     file = io.BytesIO(path.read_bytes())
 
-    def read(what):
-        size = what if isinstance(what, int) else struct.calcsize("<" + what)
-        data = file.read(min(size, sys.maxsize))
-        check(len(data) == size, f"{path} ends too early: copy or export it again")
-        return data if size == what else struct.unpack("<" + what, data)
+    def read(layout):
+        try:
+            record = struct.Struct("<" + layout)
+            return record.unpack(file.read(record.size))
+        except struct.error as e:   # too few bytes are left, or none could be enough
+            raise UserError(f"{path} ends too early: copy or export it again") from e
     return read
 
 
-def make_photo(camera, pose, ids):
-    """Photo; UserError, a sentence about it, if it cannot be used."""
-    check(camera, "has no camera in the model: export the model again")
-    model, *wh, numbers = camera
-    check(model in FOCAL_LENGTHS, f"has a fisheye or other camera, COLMAP's model {model}: run "
-          "colmap image_undistorter")
-    n = FOCAL_LENGTHS[model]
-    is_sound = (abs(numbers) < FAR).all() and min(numbers[:n]) > 1 / FAR and 0 < min(wh)
-    check(is_sound and max(wh) < 32767, f"has a camera of {wh[0]} x {wh[1]} with {numbers.tolist()}"
-          ", which cannot be: export the model again")
-    is_sound = all(abs(value) < FAR for value in pose) and any(pose[:4])   # false for nan
-    check(is_sound, "has no sound pose: run SfM again")
-    bend = np.zeros(8)
-    bend[:len(numbers) - n - 2] = numbers[n + 2:]
-    w, *v = array(pose[:4]) / math.hypot(*pose[:4])   # old files are not normalised
-    turn = cross(v, eye(3))
-    R = eye(3) + 2 * w * turn + 2 * turn @ turn   # camera to world
-    c2w = np.column_stack([R, -R @ pose[4:]])
-    return Photo("", tuple(wh), numbers[[0, n - 1, n, n + 1]], bend, c2w, ids)
-
-
 def read_photos(sparse):
-    """{name: Photo} of a COLMAP model."""
+    """{name: (camera, pose (7,), ids of points)} of a COLMAP model. camera: wh, K (4,), k1 k2 p1 p2
+    k3 .. k6 of OpenCV; None if it is missing, a fisheye or of another unknown kind."""
     cameras, photos = {}, {}
     read = open_binary(sparse / "cameras.bin")
     for _ in range(*read("Q")):
-        key, model, w, h = read("IiQQ")
-        check(0 <= model < len(PARAMETERS), f"{sparse} has camera model {model}, which is unknown: "
-              "run colmap image_undistorter")
-        cameras[key] = model, w, h, array(read(f"{PARAMETERS[model]}d"))
+        key, model, *wh = read("IiQQ")
+        is_known = 0 <= model < len(PARAMETERS)
+        check(is_known, f"{sparse} has camera model {model}: run colmap image_undistorter")
+        numbers = array(read(f"{PARAMETERS[model]}d"))
+        if model in FOCAL_LENGTHS:
+            n = FOCAL_LENGTHS[model]
+            bend = np.append(numbers[n + 2:], np.zeros(8))[:8]
+            cameras[key] = wh, numbers[[0, n - 1, n, n + 1]], bend
     read = open_binary(sparse / "images.bin")
     for _ in range(*read("Q")):
         _, *pose, camera = read("I7dI")
-        name = b"".join(iter(lambda: read(1), b"\0")).decode(errors="replace")
+        letters = iter(lambda: read("c")[0], b"\0")
+        name = b"".join(letters).decode(errors="replace")
         (count,) = read("Q")
-        ids = np.frombuffer(read(24 * count), "<u8")[2::3].tolist()   # of u, v, point
-        is_inside = name and name[0] != "/" and "\\" not in name and ".." not in name.split("/")
-        check(is_inside, f"{sparse}: photo {name!r} is outside the image folder: rename it")
-        check(name not in photos, f"{sparse}: photo {name!r} occurs twice: export the model again")
-        try:
-            photos[name] = make_photo(cameras.get(camera), pose, ids)
-        except UserError as e:
-            photos[name] = Photo(str(e))
+        ids = read(f"{3 * count}Q")[2::3]   # of u, v, point
+        places = name.replace("\\", "/").split("/")
+        is_sound = name not in photos and not {"", ".."} & set(places)
+        check(is_sound, f"{sparse}: photo {name!r} occurs twice or lies outside: rename it")
+        photos[name] = cameras.get(camera), array(pose), ids
     return photos
+
+
+def check_photo(camera, pose, is_test):
+    """UserError, a sentence about the photo, unless it can be used."""
+    check(camera, "has no camera in the model, or a fisheye: run colmap image_undistorter")
+    wh, K, bend = camera
+    numbers = array([*K, *bend, *pose])
+    is_sound = (abs(numbers) < FAR).all() and min(K[:2]) > 1 / FAR and pose[:4].any()
+    check(is_sound and max(wh) < 32767, "has no sound camera or pose: run SfM again")
+    angle = 2 * np.degrees(np.arctan(max(wh / K[:2]) / 2))
+    check(is_test or 10 <= angle <= 120, f"is {angle:.1f} degrees wide, which is not in 10..120")
+
+
+def camera_to_world(pose):
+    """COLMAP's rotation from world to camera, a quaternion, and translation (7,) -> c2w (3,4)"""
+    w, *v = pose[:4] / norm(pose[:4])   # old files are not normalised
+    turn = cross(v, eye(3))
+    R = eye(3) + 2 * w * turn + 2 * turn @ turn
+    return np.column_stack([R, -R @ pose[4:]])
 
 
 def read_points(sparse):
     """Points (K,5) of a COLMAP model, as in finish, and {id: row} of them."""
-    path = sparse / "points3D.bin"
-    triangulate = f"run colmap point_triangulator with --input_path {sparse}"
-    check(path.is_file(), f"{path} is missing: {triangulate}")
-    read = open_binary(path)
+    read = open_binary(sparse / "points3D.bin")
     points, rows = [], {}
     for _ in range(*read("Q")):
         key, x, y, z, *_, error, views = read("Q3d3BdQ")
-        read(8 * views)
-        if all(abs(value) < FAR for value in (x, y, z, error)):   # false for nan
-            rows[key] = len(points)
-            points.append((x, y, z, error, views))
+        read(f"{2 * views}I")   # the track: photos list their points
+        rows[key] = len(points)
+        points.append((x, y, z, error, views))
     points = array(points, float).reshape(-1, 5)
-    has_tracks = max(points[:, 4], default=0) > 1
-    check(has_tracks, f"{path} has {len(points)} points, none with a track: {triangulate}")
+    is_sound = (abs(points) < FAR).all(1)   # false for nan
+    points[~is_sound] = 0   # nobody sees them
+    has_tracks = (points[:, 4] > 1).any()
+    check(has_tracks, f"no point of {sparse} has a track: run colmap point_triangulator on it")
     return points, rows
 
 
 def photo_files(folder):
     """{name: path} of the photos below a folder; dense/ holds copies of those outside it."""
     files = {}
-    for path in sorted(folder.rglob("*")):
+    for path in sorted(folder.rglob("[!.]*")):
         name = path.relative_to(folder)
-        is_photo = path.suffix.lower() in PHOTO_TYPES and path.name[0] != "."
+        is_photo = path.suffix.lower() in PHOTO_TYPES
         if is_photo and name.parts[0] != "dense":
             files[name.as_posix()] = path
     return files
@@ -781,45 +776,42 @@ def photo_files(folder):
 
 def renamed(name, others):
     """Says which of the others the name means, if folder or extension alone differ."""
-    same = [other for other in others if stem(other) == stem(name)]
+    same = [other for other in others if Path(other).stem == Path(name).stem]
     return f"; {same[0]} has another folder or extension" if same else ""
 
 
-def stem(name):
-    return Path(name.replace("\\", "/")).stem.lower()
-
-
-def model_folders(folder, name="images.bin"):
+def model_folders(folder):
     """Folders with COLMAP models, at most four levels down; links are followed."""
-    found = [path.parent for depth in range(5) for path in folder.glob("*/" * depth + name)]
-    return sorted(found, key=lambda place: (len(place.parts), place))
+    found = []
+    for depth in range(5):
+        found += sorted(folder.glob("*/" * depth + "images.bin"))
+    return [path.parent for path in found]
 
 
 def open_model(folder, sparse):
     """A model with that folder of photos around it in which most of its photos are."""
     photos = read_photos(sparse)
-    around = [sparse, *sparse.parents]
-    around = around[:around.index(folder) + 1]
-    places = [place / name for place in around for name in ("images", "input", "")]
+    places = []
+    for place in (sparse, *sparse.parents):
+        places += [place / "images", place / "input", place]
+        if place == folder:
+            break
     images = max(places, key=lambda place: len(photos.keys() & photo_files(place)))
     files = photo_files(images)
     names = sorted(photos.keys() & files)   # posed, and on disk
-    return SimpleNamespace(sparse=sparse, photos=photos, images=images, files=files, names=names)
+    count = sum(photos[name][0] is not None for name in names)   # with a camera
+    return SimpleNamespace(
+        sparse=sparse, photos=photos, images=images, files=files, names=names, count=count)
 
 
 def find_model(folder, command):
-    """The model in the folder with most usable photos; says what that leaves out."""
-    places = model_folders(folder)
-    texts = model_folders(folder, "images.txt")
-    check(places or not texts, f"{folder} has models as text alone: run colmap model_converter "
-          f"--output_type BIN with input and output path {' or '.join(map(str, texts))}")
-    check(places, f"{folder} has no COLMAP model; run: python data_prep.py {command}")
-    models = [open_model(folder, place) for place in places]
-    best = max(models, key=lambda model: sum(not model.photos[n].fault for n in model.names))
-    first = min(best.photos, default="")
-    hint = renamed(first, map(str, folder.rglob("*")))
-    check(best.names, f"no photo of {best.sparse} is on disk, such as {first}{hint}: put them into "
-          f"{folder}/images, or run: python data_prep.py {command}")
+    """The model in the folder with most photos; says what that leaves out."""
+    models = [open_model(folder, place) for place in model_folders(folder)]
+    check(models, f"{folder} has no binary COLMAP model: run python data_prep.py {command}, or for "
+          "a text model colmap model_converter --output_type BIN")
+    best = max(models, key=lambda model: model.count)
+    check(best.names, f"no photo of {best.sparse} is on disk, such as {sorted(best.photos)[:1]}: "
+          f"put them into {folder}/images, or run python data_prep.py {command}")
     on_disk = max(len(model.files) for model in models if model.names)
     print(f"{best.images}: {on_disk} photos on disk, {len(best.names)} posed by {best.sparse}")
     for model in models:
@@ -830,6 +822,7 @@ def find_model(folder, command):
 
 def read_table(path):
     """Lines of a table of any separator, as lists of words."""
+    check(path.is_file(), f"the split file {path} is missing")
     text = path.read_bytes().decode("utf-8-sig", "replace")
     lines = [line for line in text.splitlines() if line.strip()] or [""]
     mark = max("\t;,", key=lines[0].count)
@@ -837,59 +830,62 @@ def read_table(path):
 
 
 def read_split(path):
-    """{name: "train" or "test"} of a table with NeRF-W's columns, without the rows with an empty
-    id; or of train_list.txt and test_list.txt, one of which is `path`."""
-    check(path.is_file(), f"the split file {path} is not there")
+    """{name: whether it is held out} of a table with NeRF-W's columns, without the rows with an
+    empty id; or of train_list.txt and test_list.txt, one of which is `path`."""
     head, *rows = read_table(path)
-    if path.suffix == ".txt" and "split" not in head:
-        head = "filename", "split"
+    if path.suffix == ".txt":
+        head = ["filename", "split"]
         rows = []
-        for part, other in ("train", "test"), ("test", "train"):
-            table = path.with_name(path.name.replace(other, part))
-            check(table.is_file(), f"{table} is missing: a split needs both lists")
-            rows += [(words[0], part) for words in read_table(table)]
+        for part in ("train", "test"):
+            names = read_table(path.with_name(re.sub("train|test", part, path.name)))
+            rows += [(name, part) for name, *_ in names]
     check({"filename", "split"} <= set(head), f"{path} needs a header with filename and split")
-    split = {}
+    held_out = {}
     for words in rows:
         row = dict(zip(head, words))
         name, part = row.get("filename"), row.get("split")
         if row.get("id") == "":
             continue
-        is_sound = name and part in ("train", "test") and split.setdefault(name, part) == part
+        is_test = part == "test"
+        is_sound = name and part in ("train", "test") and held_out.get(name, is_test) == is_test
         check(is_sound, f"{path}: {name!r} is {part!r}; each is train or test, and not both")
-    return split
+        held_out[name] = is_test
+    return held_out
 
 
 def find_split(folder):
     """The split file of a folder, or one of its two lists, or None."""
-    tables = sorted([*folder.glob("[!.]*.tsv"), *folder.glob("[!.]*.csv")])   # or of other things:
-    tables = [path for path in tables if path.suffix == ".tsv" or "split" in read_table(path)[0]]
-    tables = tables or list(folder.glob("train*.txt"))
-    names = ", ".join(table.name for table in tables)
-    check(len(tables) < 2, f"{folder} has several split files ({names}): choose by --split")
+    tables = sorted(folder.glob("[!.]*.[ct]sv"))
+    tables = [path for path in tables if "split" in read_table(path)[0]]
+    if not tables:
+        tables = list(folder.glob("train*.txt"))
+    check(len(tables) < 2, f"choose a split file by --split: {', '.join(map(str, tables))}")
     return tables[0] if tables else None
 
 
-def fingerprint(folder, images, split):
+def fingerprint(info):
     """Of names, sizes and times of all files that a scene is read from."""
-    paths = [*photo_files(images).values(), *folder.glob("*.*")]
+    folder = Path(info["folder"])
+    paths = [*photo_files(Path(info["images"])).values(), *folder.glob("*.*")]
     for place in model_folders(folder):
         paths += place.glob("*.bin")
-    paths += [Path(split)] if split else []
-    paths = [path for path in sorted(paths) if path.exists()]
-    lines = [f"{path} {path.stat().st_size} {path.stat().st_mtime_ns}" for path in paths]
-    return zlib.crc32(os.fsencode("\n".join(lines)))
+    if info["split"]:
+        paths.append(Path(info["split"]))
+    checksum = 0
+    for path in sorted(paths):
+        if path.exists():
+            line = f"{path} {path.stat().st_size} {path.stat().st_mtime_ns}\n"
+            checksum = zlib.crc32(os.fsencode(line), checksum)
+    return checksum
 
 
 def decode(path):
     """The photo, BGR as OpenCV has it, unturned as COLMAP has it. -> uint8 (h,w,3)"""
     data = path.read_bytes()
-    is_whole = True   # OpenCV says nothing where a file is cut off
-    if data[:2] == b"\xff\xd8":   # a JPEG: an end mark follows its last scan
-        is_whole = data.rfind(b"\xff\xd9") > data.rfind(b"\xff\xda")
-    if data[1:4] == b"PNG":
-        is_whole = b"IEND" in data
-    check(is_whole, "is cut off: copy it again")
+    # OpenCV says nothing where a file is cut off. A JPEG has an end mark after its last scan.
+    is_cut_jpeg = data[:2] == b"\xff\xd8" and data.rfind(b"\xff\xd9") < data.rfind(b"\xff\xda")
+    is_cut_png = data[1:4] == b"PNG" and b"IEND" not in data
+    check(not is_cut_jpeg and not is_cut_png, "is cut off: copy it again")
     flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
@@ -899,104 +895,101 @@ def decode(path):
     return image
 
 
-def read_photo(path, photo, downscale):
+def read_photo(path, camera, downscale):
     """Undistorted, then reduced. -> rgb uint8 (h,w,3), K (4,)"""
-    w, h = photo.wh
-    K = photo.K
-    check(downscale <= min(w, h) / 2, f"is {w} x {h}: --downscale {downscale} leaves nothing of it")
+    (w, h), K, bend = camera
+    check(1 <= downscale <= min(w, h) / 2, f"is {w} x {h}: choose another --downscale")
     image = decode(path)
     size = image.shape[1::-1]
-    check(size == photo.wh, f"has {size[0]} x {size[1]} pixels, its camera {w} x {h}: put back the "
-          "photos that SfM saw")
-    if photo.bend.any():   # OpenCV's first pixel is at 0
-        M = array([[K[0], 0, K[2] - 0.5], [0, K[1], K[3] - 0.5], [0, 0, 1]])
-        P = cv2.getOptimalNewCameraMatrix(M, photo.bend, (w, h), 0)[0]   # shows nothing but photo
-        if P[0, 0] <= M[0, 0] and P[1, 1] <= M[1, 1]:
-            P = M
-        image = cv2.undistort(image, M, photo.bend, None, P)
-        K = P[[0, 1, 0, 1], [0, 1, 2, 2]] + (0, 0, 0.5, 0.5)
-    small = array((w // downscale, h // downscale))
-    image = cv2.resize(image, small.tolist(), interpolation=cv2.INTER_AREA)
-    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB), K * np.tile(small / photo.wh, 2)
+    check(size == (w, h),
+          f"has {size[0]} x {size[1]} pixels, its camera {w} x {h}: put back what SfM saw")
+    if bend.any():
+        places = [0, 1, 0, 1], [0, 1, 2, 2]   # of fx fy cx cy in a matrix
+        corner = 0, 0, 0.5, 0.5   # OpenCV's first pixel is at 0
+        M = eye(3)
+        M[places] = K - corner
+        P, _ = cv2.getOptimalNewCameraMatrix(M, bend, (w, h), 0)   # shows nothing but photo
+        image = cv2.undistort(image, M, bend, None, P)
+        K = P[places] + corner
+    small = w // downscale, h // downscale
+    image = cv2.resize(image, small, interpolation=cv2.INTER_AREA)
+    return image[..., ::-1], K * (small * 2) / (w, h, w, h)
 
 
 def choose_parts(folder, model, split):
-    """{name: "train" or "test"} of the photos that are to be used; says by which rule."""
+    """{name: whether it is held out} of the photos that are to be used; says by which rule."""
     table = Path(split) if split else find_split(folder)
     if table is None:
         print(f"{folder} has no split file: every eighth photo is held out")
-        return {n: "test" if i % 8 == 7 else "train" for i, n in enumerate(model.names)}
-    parts = read_split(table)
+        return {name: i % 8 == 7 for i, name in enumerate(model.names)}
+    held_out = read_split(table)
     print(f"split by {table}")
-    rest = set(model.names) - parts.keys()
+    rest = set(model.names) - held_out.keys()
     if rest:
         warn(f"{len(rest)} photos are not in {table}: {min(rest)} ...")
-    return parts
+    return held_out
 
 
-def read_usable(model, parts, downscale):
-    """{name: (rgb, K)} of the photos that can be used; says which cannot, and why."""
-    usable, faults = {}, {}
-    for name in progress(sorted(parts), "preparing photos"):
+def read_usable(model, held_out, downscale):
+    """{name: (rgb, K, c2w, ids)} of the photos that can be used; says which cannot, and why."""
+    usable = {}
+    for name in progress(sorted(held_out), "preparing photos"):
         try:
-            hint = renamed(name, model.names)
-            check(name in model.names, f"has no pose or no file{hint}")
-            photo = model.photos[name]
-            check(not photo.fault, photo.fault)
-            angle = 2 * np.degrees(np.arctan(max(photo.wh / photo.K[:2]) / 2))
-            is_usual = parts[name] == "test" or 10 <= angle <= 120
-            check(is_usual, f"is {angle:.1f} degrees wide, which is not in 10..120")
-            usable[name] = read_photo(model.files[name], photo, downscale)
+            if name not in model.names:
+                raise UserError(f"has no pose or no file{renamed(name, model.names)}")
+            camera, pose, ids = model.photos[name]
+            check_photo(camera, pose, held_out[name])
+            image, K = read_photo(model.files[name], camera, downscale)
+            usable[name] = image, K, camera_to_world(pose), ids
         except UserError as e:
-            faults[name] = f"{name} {e}"
             warn(f"left out: {name} {e}")
-    lost = [faults[name] for name in faults if parts[name] == "test"]
-    lost = "; ".join(lost[:3]) + f" and {len(lost) - 3} more" * (len(lost) > 3)
-    check(not lost, f"held-out photos cannot be used: {lost}; mend them, or hold out others")
-    count = sum(parts[name] == "train" for name in usable)
-    first = min(faults.values(), default="mend the split file")
-    check(count >= 2, f"{count} usable training photos are too few: {first}")
+    lost = [name for name in held_out if held_out[name] and name not in usable]
+    check(not lost, f"held-out photos cannot be used, mend them or hold out others: {lost}")
+    count = sum(not held_out[name] for name in usable)
+    check(count >= 2, f"{count} usable training photos are too few: mend them or the split file")
     return usable
 
 
 def prepare(name, downscale=2, split=None):
     """Scene of one of SCENES, or of a folder with photos and a COLMAP model; see FORMAT."""
-    check(downscale >= 1, f"--downscale {downscale} is not 1 or more")
-    folder, command = Path(name), f"{name} --sfm"
+    folder = Path(name)
+    command = f"{name} --sfm"
     if name in SCENES:
-        folder, command = Path("data", name), f"{name} --download"
+        folder = DATA / name
+        command = f"{name} --download"
         if not folder.is_dir():
-            folder = Path("data", SCENES[name][0])
+            folder = DATA / SCENES[name][0]
     model = find_model(folder, command)
-    files = fingerprint(folder, model.images, split)
-    parts = choose_parts(folder, model, split)
+    split = os.path.abspath(split) if split else None
+    info = dict(scene=folder.resolve().name, kind="colmap", downscale=downscale,
+                folder=str(folder), images=str(model.images), split=split)
+    info["files"] = fingerprint(info)
+    held_out = choose_parts(folder, model, split)
     points, rows = read_points(model.sparse)
-    photos = model.photos
-    for photo in photos.values():
-        photo.points = array([rows[key] for key in photo.points if key in rows], int)
-    usable = read_usable(model, parts, downscale)
-    images, K = zip(*usable.values())
-    is_test = array([parts[name] == "test" for name in usable])
-    c2w = [photos[name].c2w for name in usable]
-    tracks = [photos[name].points for name in usable]
-    info = dict(scene=folder.resolve().name, kind="colmap", downscale=downscale, files=files,
-                folder=str(folder), images=str(model.images), split=None)
-    if split:
-        info["split"] = str(Path(split).resolve())
+    usable = read_usable(model, held_out, downscale)
+    images, K, c2w, ids = zip(*usable.values())
+    is_test = [held_out[name] for name in usable]
+    tracks = []
+    for own in ids:
+        own = [rows[key] for key in own if key in rows]
+        tracks.append(array(own, int))
     scene = finish(images, K, c2w, is_test, list(usable), points, tracks, info)
-    uv = scene["track_uv"]
-    share = ((uv >= 0) & (uv <= 1)).all(1).mean()
-    if np.std(uv) < .02:
-        share = 0   # all in the middle: points in smaller units than the poses
-    says = f"{share:.0%} of the sightings of {model.sparse} fall into the photo that saw them"
-    check(share >= .5, f"only {says}: give poses as COLMAP does, world to camera, x right, y down, "
-          "z forward, in the units of the points")
-    if share < .9:
-        warn(f"only {says}")
-    inside = (norm(scene["points"], axis=1) < 1).mean()
+    check_sightings(scene["track_uv"])
+    is_inside = norm(scene["points"], axis=1) < 1
     print(f"the sphere has a radius of {scene['scale']:.3g} units of the reconstruction; "
-          f"{inside:.0%} of the points are inside")
+          f"{is_inside.mean():.0%} of the points are inside")
     return scene
+
+
+def check_sightings(uv):
+    """UserError if points (T,2) seldom fall into 0..1, the photo that saw them, or all into its
+    middle: then points have smaller units than poses."""
+    share = (abs(uv - .5) <= .5).all(1).mean()
+    says = f"only {share:.0%} of all sightings of points fall into the photo that saw them"
+    check(share >= .5 and np.std(uv) > .02, f"{says}: give poses as COLMAP does, world to camera, "
+          "x right, y down, z forward, in the units of the points")
+    if share < .9:
+        warn(says)
 
 
 def scene_path(name_or_folder):
@@ -1005,48 +998,53 @@ def scene_path(name_or_folder):
     mark = ""
     if name_or_folder not in ("toy", *SCENES):
         mark = f"-{zlib.crc32(os.fsencode(folder)):08x}"
-    return Path("data", f"{folder.name}{mark}.npz")
+    return DATA / f"{folder.name}{mark}.npz"
 
 
 def open_scene(name_or_folder, downscale=2):
     """Scene from its file: made on first use, and anew if its sources differ in any way."""
     path = scene_path(name_or_folder)
-    is_toy = name_or_folder == "toy"
     split = None
     if path.exists():
         scene = read_scene(path)
         info = json.loads(str(scene["info"]))
         split = info["split"]   # named once, by --split
-        folder, images = Path(info["folder"] or ""), Path(info.get("images", ""))
-        is_alone = is_toy or not folder.is_dir()   # a scene file does without its sources
-        if is_alone or info.get("files") == fingerprint(folder, images, split):
-            if is_toy or info["downscale"] == downscale:
-                return scene
+        if info["kind"] == "toy" or (info["downscale"] == downscale and is_fresh(info)):
+            return scene
     print(f"making {path}")
-    scene = make_toy() if is_toy else prepare(name_or_folder, downscale, split)
+    scene = make_toy() if name_or_folder == "toy" else prepare(name_or_folder, downscale, split)
     write_scene(path, scene)
     return scene
 
 
+def is_fresh(info):
+    """Whether a scene's sources are as they were, or gone: a scene file does without them."""
+    return not Path(info["folder"]).is_dir() or info.get("files") == fingerprint(info)
+
+
 # ---- download, SfM, command line -----------------------------------------------------------------
 def fetch(url, path):
-    """Streams url into path; what came of a broken transfer waits in path.part to be continued."""
+    """Streams url into path, unless that exists; what came of a broken transfer waits in path.part
+    to be continued."""
+    if path.exists():
+        return
     part = path.with_name(path.name + ".part")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+        path.parent.mkdir(exist_ok=True)
         with open(part, "ab") as file:   # the last byte again: so a whole part is no special case
             have = max(file.tell() - 1, 0)
-            request = urllib.request.Request(url, headers={"Range": f"bytes={have}-"})
-            with urllib.request.urlopen(request, timeout=60) as answer:
+            request = Request(url, headers={"Range": f"bytes={have}-"})
+            with urlopen(request, timeout=60) as answer:
                 if answer.status != 206:
                     have = 0   # a server without ranges starts over
-                total = have + int(answer.headers.get("Content-Length", -1))
+                total = have + int(answer.headers["Content-Length"])
                 file.truncate(have)
                 for _ in progress(range(have, total, 1 << 20), f"MiB of {path.name}"):
                     have += file.write(answer.read(1 << 20))
-        check(have == total, f"the download of {url} broke off; the same command continues it")
+        if have != total:
+            raise OSError("it ended early")
         os.replace(part, path)
-    except (OSError, http.client.HTTPException) as e:
+    except Exception as e:   # of the disk, the network or its protocol
         if getattr(e, "code", 0) == 416:   # longer than the file itself
             part.unlink()
         raise UserError(f"the download of {url} broke ({e}); the same command continues it") from e
@@ -1066,21 +1064,20 @@ def unpack(archive, wanted, folder):
 def download(name, archive_url=ARCHIVE_URL, split_url=SPLIT_URL):
     """Photos and reconstruction of one of SCENES, with its split file -> data/<name>/"""
     check(name in SCENES, f"--download knows {', '.join(SCENES)}, not {name}")
-    scene, table_name = SCENES[name]
-    home = Path("data", name)
-    table = Path("data", table_name)
-    archive = Path("data", f"{scene}.tar.gz")
+    scene, table = SCENES[name]
+    home = DATA / name
+    table = DATA / table
+    archive = DATA / f"{scene}.tar.gz"
     check(not home.exists(), f"{home} is there already: move it, or leave --download out")
-    if not table.exists():
-        fetch(split_url + table.name, table)
-    if not archive.exists():
-        fetch(archive_url + archive.name, archive)
+    fetch(split_url + table.name, table)
+    fetch(archive_url + archive.name, archive)
     try:
-        with tempfile.TemporaryDirectory(dir="data") as temporary:
+        with tempfile.TemporaryDirectory(dir=DATA) as temporary:
             unpack(archive, (f"{scene}/dense/images/", f"{scene}/dense/sparse/"), temporary)
-            shutil.copy(table, Path(temporary, scene, table.name))
-            os.replace(Path(temporary, scene), home)
-    except (tarfile.TarError, EOFError, zlib.error, OSError, TypeError) as e:
+            place = Path(temporary) / scene
+            shutil.copy(table, place / table.name)
+            os.replace(place, home)
+    except Exception as e:   # a damaged archive can fail in any layer
         raise UserError(f"cannot unpack {archive} ({e}): free space, or delete it and retry") from e
 
 
@@ -1090,8 +1087,8 @@ def run_sfm(folder):
     database = folder / "database.db"
     models = folder / "models"
     dense = folder / "dense"
-    is_new = folder.is_dir() and not dense.exists()
-    check(is_new, f"{folder} is missing, or has dense/: delete that")
+    check(folder.is_dir() and not dense.exists(),
+          f"{folder} is missing, or has dense/: delete that")
     models.mkdir(exist_ok=True)
     # Of 135 photos of a statue in all lights these options pose 104 in one model instead of 60.
     features = pycolmap.FeatureExtractionOptions()
@@ -1116,8 +1113,7 @@ def main(argv=None):
     add("--download", action="store_true", help="fetch archive and split file first")
     add("--sfm", action="store_true", help="the folder has raw photos: pose them first")
     add("--downscale", type=int, help="photos get this many times smaller; default 2")
-    add("--split", help="table of training and test photos; default: <folder>/*.tsv or *.csv, or "
-        "train_list.txt and test_list.txt, or every eighth photo")
+    add("--split", help="default: a .tsv, .csv or train_list.txt in the folder, or every 8th photo")
     knobs = inspect.signature(make_toy).parameters
     for key, knob in knobs.items():
         how = {"type": type(knob.default)}
@@ -1140,7 +1136,7 @@ def main(argv=None):
         scene = make_toy(**given) if name == "toy" else prepare(name, **given)
         write_scene(path, scene)
     except (UserError, OSError, MemoryError, ImportError, KeyboardInterrupt) as e:
-        warn(f"error: {e}" if str(e) else "error: stopped; start again")
+        warn(f"error: {str(e) or 'stopped; start again'}")
         sys.exit(2)
     print(f"{path}: {len(scene['wh'])} photos, {scene['is_test'].sum()} of them for testing")
 
