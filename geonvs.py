@@ -844,19 +844,20 @@ def gpl_loss(mask, phi):
     return (mask * phi).mean()
 
 
-def transient_loss(logit, excess):
-    """Teaches M = 1 to rays whose error exceeds their price, by excess (R,), M = 0 to the others.
-    The same M minimises (1 - M) error + M price, but the slope of that vanishes where the sigmoid
-    is flat. [D7]"""
-    is_transient = (excess > 0).float()
-    return F.binary_cross_entropy_with_logits(logit, is_transient, excess.abs())
+def transient_loss(logit, error, price):
+    """Teaches M = 1 to rays whose error (R,) exceeds their price (R,), M = 0 to the others. The
+    same M minimises (1 - M) error + M price, but the slope of that vanishes where the sigmoid is
+    flat. [D7]"""
+    is_transient = (error > price).float()
+    weight = (error - price).abs()
+    return F.binary_cross_entropy_with_logits(logit, is_transient, weight)
 
 
-def doubted(mask, excess, done):
-    """M (R,), but 1 where an error above its price (excess (R,) > 0) confirms what the network
-    suspects. A suspicion has to be stronger from step to step, and ends after 30 % of training:
-    at first the scene must not learn to paint people, later it must learn its details. [D7]"""
-    is_confirmed = (excess > 0) & (mask > done / DOUBTED)
+def doubted(mask, is_wrong, done):
+    """M (R,), but 1 where an error above its price (is_wrong) confirms what the network suspects.
+    The suspicion has to be stronger from step to step, and this ends after 30 % of training: at
+    first the scene must not learn to paint people, later it must learn its details. [D7]"""
+    is_confirmed = is_wrong & (mask > done / DOUBTED)
     return torch.where(is_confirmed, 1.0, mask)
 
 
@@ -997,10 +998,10 @@ class GeoNVS(nn.Module):
             logit = sample_logits(self.mask.logits(photos), rays.uv)  # (R,)
             mask = logit.detach().sigmoid()
             price = self.mask.price(phi, cfg.lam_mask, cfg.lam_gpl)
-            excess = error * ~is_static - price  # (R,) SfM pixels: M = 0 [D10]
+            dynamic = error * ~is_static  # (R,) SfM pixels: M = 0 [D10]
             if done < TAUGHT:
-                l_mask = transient_loss(logit, excess)
-            mask = doubted(mask, excess, done)
+                l_mask = transient_loss(logit, dynamic, price)
+            mask = doubted(mask, dynamic > price, done)
 
         which = random_index(gen, cfg.samples + 1, R)
         t = out["t"].gather(1, which[:, None])  # (R,1)
