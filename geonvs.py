@@ -1559,23 +1559,18 @@ def write_panel(path, model, scene, codes, width=240):
     rows = []
     for photo in photos.tolist():
         frame = render_photo(model, scene, photo, codes[photo])
-        kind = "held out" if scene.is_test[photo] else "training"
-        tiles = {
-            f"{kind}: {scene.raw['name'][photo]}": frame["truth"],
-            "render": frame["rgb"],
-            "normals": frame["normal"] / 2 + 0.5}
+        tiles = [frame["truth"], frame["rgb"], frame["normal"] / 2 + 0.5]
         if model.cfg.mask != "off":
             M = model.mask.logits([photo]).detach().sigmoid()  # (1,1,m,m)
-            tiles["mask: white is transient"] = M[0, 0, :, :, None].expand(-1, -1, 3).cpu()
+            tiles.append(M[0, 0, :, :, None].expand(-1, -1, 3).cpu())
         h, w = frame["rgb"].shape[:2]
         size = (width, width * h // w)
-        row = []
-        for text, tile in tiles.items():
-            tile = cv2.resize(to_uint8(tile), size, interpolation=cv2.INTER_AREA)
-            tile = np.pad(tile, ((20, 4), (0, 4), (0, 0)), constant_values=255)
-            cv2.putText(tile, text, (2, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.4, (0, 0, 0))
-            row.append(tile)
-        rows.append(np.hstack(row))
+        row = [cv2.resize(to_uint8(tile), size, interpolation=cv2.INTER_AREA) for tile in tiles]
+        row = np.pad(np.hstack(row), ((20, 0), (0, 0), (0, 0)), constant_values=255)
+        kind = "held out" if scene.is_test[photo] else "training"
+        text = f"{kind}: {scene.raw['name'][photo]}, render, normals, mask (white: transient)"
+        cv2.putText(row, text, (2, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.4, (0, 0, 0))
+        rows.append(row)
     picture = np.vstack(rows)[:, :, ::-1]
     atomic_write(path, lambda part: cv2.imwrite(str(part), picture))
 
@@ -1591,13 +1586,15 @@ def finish(model, scene, state, run):
     scores, codes = evaluate(model, scene, make_lpips(device))
     write_panel(run / "panel.png", model, scene, codes)
     if isinstance(model, GeoNVS):
+        level = model.sdf.octree.cells[:, 0]
+        scores["octree_cells"] = level.bincount().tolist()  # by level
         write_ply(run / "mesh.ply", *extract_mesh(model))
         if scene.info["kind"] == "toy":
             scores |= toy_truth(model, scene)
     joules = state["joules"]
     is_metered = joules is not None
     parameters = sum(p.numel() for p in model.parameters())
-    cells = [octree.cells[:, 0].bincount().tolist() for octree in model.octrees]  # by level
+    cells = sum(len(octree.cells) for octree in model.octrees)
     here = Path(__file__).parent
     status, commit = subprocess.getstatusoutput(f'git -C "{here}" describe --always --dirty')
     metrics = scores | dict(
@@ -1610,9 +1607,8 @@ def finish(model, scene, state, run):
         energy_wh=joules / 3600 if is_metered else None,
         energy_source=f"the device's counter, read every {PAUSE} s" if is_metered else None,
         rays_per_second=state["step"] * model.cfg.rays / state["seconds"],
-        octree_cells=cells[0] if cells else None,
         parameters=parameters,
-        model_bytes=4 * parameters + 44 * sum(map(sum, cells)),  # a cell: child, 8 corners, 8 flags
+        model_bytes=4 * parameters + 44 * cells,  # a cell: child, 8 corners, 8 flags
         peak_memory_bytes=peak,
         protocol="appearance fitted on the left half, scored on the right half",
         torch=torch.__version__,
@@ -1628,28 +1624,24 @@ def in_between(keys, n):
 
 
 def film(model, scene, path):
-    """mp4 at 24 frames/s: a training camera sways sideways, a tenth of the sphere's radius, while
-    the light goes from photo to photo."""
+    """mp4 at 24 frames/s: the first training camera sways sideways, by a tenth of the sphere's
+    radius, while the light goes from photo to photo."""
     photos = scene.photos(False)
     stops = photos[::math.ceil(len(photos) / 7)]
     codes = in_between(model.codes()[stops], 24 * len(stops))  # (n,A)
-    photo = stops[len(stops) // 2].item()
-    c2w = scene.c2w[photo]
-    moving = scene._replace(c2w=scene.c2w.clone())
-    pictures = []
-    for code in progress(codes, f"filming {len(codes)} frames"):
-        sway = 0.1 * math.sin(len(pictures) / 24)
-        moving.c2w[photo, :, 3] = c2w[:, 3] + sway * c2w[:, 0]
-        frame = render_photo(model, moving, photo, code)
-        pictures.append(to_uint8(frame["rgb"][:, :, ::-1]))
-    w, h = scene.wh[photo].tolist()
-    size = (w // 2 * 2, h // 2 * 2)  # codecs want even sides
+    photo = photos[0].item()
+    position = scene.c2w[photo, :, 3]
+    scene = scene._replace(c2w=scene.c2w.clone())
+    camera = scene.c2w[photo]  # (3,4), a part of the copy
+    w, h = (scene.wh[photo] // 2 * 2).tolist()  # codecs want even sides
 
     def write(part):
         codec = cv2.VideoWriter_fourcc(*"mp4v")
-        video = cv2.VideoWriter(str(part), codec, 24, size)
-        for picture in pictures:
-            video.write(cv2.resize(picture, size))
+        video = cv2.VideoWriter(str(part), codec, 24, (w, h))
+        for n, code in enumerate(progress(codes, f"filming {len(codes)} frames")):
+            camera[:, 3] = position + 0.1 * math.sin(n / 24) * camera[:, 0]
+            frame = render_photo(model, scene, photo, code)
+            video.write(to_uint8(frame["rgb"][:h, :w, ::-1]))
         video.release()
         return part.stat().st_size > 0
     atomic_write(path, write)
@@ -1719,12 +1711,11 @@ def main(argv=None):
     resume = given.pop("resume", False)
     render = given.pop("render", False)
     cfg = make_config(given)
-    scene_file = data_prep.scene_path(cfg.source)
-    run = Path("runs", cfg.name or f"{scene_file.stem}-{GeoNVS.name}-{cfg.seed}")
-    path = run / "checkpoint.pt"
+    scene_name = data_prep.scene_path(cfg.source).stem
+    run = Path("runs", cfg.name or f"{scene_name}-{GeoNVS.name}-{cfg.seed}")
     saved = None
     if resume or render:
-        saved, cfg = read_checkpoint(path, given)
+        saved, cfg = read_checkpoint(run / "checkpoint.pt", given)
     check(cfg.rays % (cfg.photos * RANKS) == 0,
           f"--rays {cfg.rays} must be a multiple of --photos {cfg.photos} times {RANKS} processes")
     device = pick_device(cfg.device)
