@@ -1114,7 +1114,7 @@ def open_counter(device, rapl="/sys/class/powercap"):
         import pynvml
         pynvml.nvmlInit()
         gpus = []
-        for number in range(device.index, device.index + RANKS):
+        for number in range(RANKS):
             uuid = torch.cuda.get_device_properties(number).uuid
             gpus.append(pynvml.nvmlDeviceGetHandleByUUID(f"GPU-{uuid}"))
         return lambda: sum(map(pynvml.nvmlDeviceGetTotalEnergyConsumption, gpus)) / 1e3  # mJ
@@ -1274,6 +1274,7 @@ def train(cfg, scene, run, saved=None, kind=GeoNVS):
             dist.broadcast(value, 0)
         gen.manual_seed(cfg.seed + RANK + RANKS * state["step"])  # own rays for each process
     meter = EnergyMeter(gen.device, state["joules"])
+    meter.tick()
     photos = scene.photos(False)
     begin = time.perf_counter() - state["seconds"]
     next_log = 0.0
@@ -1284,7 +1285,8 @@ def train(cfg, scene, run, saved=None, kind=GeoNVS):
         done = state["step"] / cfg.steps
         if cfg.minutes > 0:
             done = state["seconds"] / (60 * cfg.minutes)
-        if RANK == 0 and (done >= 1 or state["seconds"] >= next_log):
+        is_due = done >= 1 or state["seconds"] >= next_log
+        if RANK == 0 and terms and is_due:
             next_log = state["seconds"] + PAUSE
             meter.tick()
             state["joules"] = meter.joules
@@ -1739,7 +1741,9 @@ def run_command_line(entry):
         return
     except (UserError, OSError) as error:  # a full disk, a folder without permission
         message = str(error)
-    except (torch.OutOfMemoryError, MemoryError):
+    except (RuntimeError, MemoryError) as error:  # a CPU's allocator has no error of its own
+        if isinstance(error, RuntimeError) and "allocate" not in str(error):
+            raise
         message = "the memory is full: begin anew with fewer --rays or a larger --downscale"
     except KeyboardInterrupt:
         message = f"stopped; --resume goes on from the last checkpoint, made every {PAUSE} s"
