@@ -178,9 +178,8 @@ def load_scene(raw, device="cpu"):
     usual = np.median(raw["wh"].max(1))  # px
     side = int(np.clip(usual / 2, 96, 256))  # [D6]
     thumbs = []
-    for first, (w, h) in zip(raw["start"], raw["wh"]):
-        photo = raw["rgb"][first:first + w * h]
-        photo = photo.reshape(h, w, 3)
+    for pixels, (w, h) in zip(np.split(raw["rgb"], raw["start"][1:]), raw["wh"]):
+        photo = pixels.reshape(h, w, 3)
         thumbs.append(cv2.resize(photo, (side, side), interpolation=cv2.INTER_AREA))
     arrays = [raw[key] for key in Scene._fields[:10]]
     arrays.append(np.stack(thumbs).transpose(0, 3, 1, 2))
@@ -188,7 +187,7 @@ def load_scene(raw, device="cpu"):
     for array in arrays:
         tensor = torch.as_tensor(array, device=device)
         if tensor.is_floating_point():
-            tensor = tensor.to(torch.get_default_dtype())
+            tensor = tensor.float()
         tensors.append(tensor)
     return Scene(*tensors, raw, json.loads(str(raw["info"])))
 
@@ -1200,15 +1199,10 @@ def make_optimizer(model):
     return torch.optim.Adam(model.groups(), **model.adam, fused=True)
 
 
-def fingerprint(scene):
-    """What a checkpoint must share with the scene that it is read for."""
-    return [scene.raw[key].tolist() for key in ("name", "is_test", "scale", "center")]
-
-
 def save_checkpoint(path, model, optimizer, gen, state):
     saved = dict(
         config=asdict(model.cfg),
-        scene=fingerprint(model.scene),
+        scene=model.scene.info,
         octrees=[octree.split_keys for octree in model.octrees],
         model=model.state_dict(),
         optimizer=optimizer.state_dict(),
@@ -1238,7 +1232,7 @@ def read_checkpoint(path, given):
 def restore(saved, path, model, gen):
     """Puts a checkpoint's weights into a model and its state into gen; returns its optimiser."""
     try:
-        check(saved["scene"] == fingerprint(model.scene), "another scene or split")
+        check(saved["scene"] == model.scene.info, "another scene or split")
         for octree, keys in zip(model.octrees, saved["octrees"], strict=True):
             octree.build(keys.to(octree.features.device))
         model.load_state_dict(saved["model"])
@@ -1507,8 +1501,7 @@ def extract_mesh(model):
         grid.refresh(model.distance, part, n + 1)
     volume = grid.volume[0, 0].cpu().numpy()
     square = np.linspace(-1, 1, n + 1) ** 2
-    radius = np.sqrt(square[:, None, None] + square[:, None] + square)  # (n+1,n+1,n+1)
-    is_inside = radius < 1
+    is_inside = square[:, None, None] + square[:, None] + square < 1  # (n+1,n+1,n+1)
     if len(np.unique(volume[is_inside] < 0)) < 2:
         empty = np.zeros((0, 3))
         return empty, empty, empty
@@ -1563,8 +1556,8 @@ def write_panel(path, model, scene, codes, width=240):
         frame = render_photo(model, scene, photo, codes[photo])
         tiles = [frame["truth"], frame["rgb"], frame["normal"] / 2 + 0.5]
         if model.cfg.mask != "off":
-            M = model.mask.logits([photo]).detach().sigmoid()  # (1,1,m,m)
-            tiles.append(M[0, 0, :, :, None].expand(-1, -1, 3).cpu())
+            M = model.mask.logits([photo])[0, 0].detach().sigmoid().cpu()  # (m,m)
+            tiles.append(np.dstack([M, M, M]))
         h, w = frame["rgb"].shape[:2]
         size = (width, width * h // w)
         row = [cv2.resize(to_uint8(tile), size, interpolation=cv2.INTER_AREA) for tile in tiles]

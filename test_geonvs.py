@@ -2794,7 +2794,7 @@ def test_a_checkpoint_of_other_settings_or_split_is_refused_and_its_run_stays(
     run_training(scene, tmp_path)
     before = read_files(tmp_path)
     if not changes:
-        scene = scene._replace(raw=scene.raw | dict(is_test=~scene.raw["is_test"]))
+        scene = scene._replace(info=scene.info | dict(split="other.tsv"))
     with pytest.raises(UserError, match="does not fit"):
         run_training(scene, tmp_path, read_saved(tmp_path), **changes)
     assert read_files(tmp_path) == before
