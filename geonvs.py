@@ -80,7 +80,8 @@ torch.set_float32_matmul_precision("highest")  # [D9] no TF32, which some contai
 # ---- 1 Config: every field is a flag -------------------------------------------------------------
 
 def opt(default, text, *choices):
-    return field(default=default, metadata={"help": text, "choices": choices or None})
+    text = f"{text} [{default}]"
+    return field(default=default, metadata=dict(help=text, choices=choices or None))
 
 
 AT_LEAST = dict(
@@ -100,7 +101,7 @@ class Config:
     data: str = opt("", "an IMC-PT or COLMAP folder instead of a named scene")
     name: str = opt("", "run folder below runs/ (default: scene-method-seed)")
     seed: int = opt(0, "seed of everything random")
-    device: str = opt("auto", "auto, cpu, cuda or cuda:N")
+    device: str = opt("auto", "auto: a GPU if there is one", "auto", "cpu", "cuda")
     steps: int = opt(3000, "training steps")
     minutes: float = opt(0.0, "training budget in minutes, instead of --steps if above 0")
     downscale: int = opt(2, "integer factor by which photos are made smaller (benchmarks use 2)")
@@ -125,15 +126,12 @@ class Config:
     lr_net: float = opt(2e-3, "learning rate of networks")
 
     def __post_init__(self):
-        """Refuses what cannot work, before anything is written."""
+        """Refuses numbers that cannot work, before anything is written."""
         for setting in fields(self):
             value = getattr(self, setting.name)
-            choices = setting.metadata["choices"]
-            flag = f"--{setting.name} {value} makes no sense"
-            check(choices is None or value in choices, f"{flag}: choose one of {choices}")
-            if setting.type is not str:
-                least = AT_LEAST.get(setting.name, 0)
-                check(least <= value < 2**31, f"{flag}: use a number from {least}")
+            least = AT_LEAST.get(setting.name, 0)
+            is_good = setting.type is str or least <= value < 2**31
+            check(is_good, f"--{setting.name} {value} makes no sense: use a number from {least}")
 
     @property
     def source(self):
@@ -180,9 +178,8 @@ def load_scene(raw, device="cpu"):
     usual = np.median(raw["wh"].max(1))  # px
     side = int(np.clip(usual / 2, 64, 256))  # [D6]
     thumbs = []
-    for first, (w, h) in zip(raw["start"], raw["wh"]):
-        photo = raw["rgb"][first:first + w * h]
-        photo = photo.reshape(h, w, 3)
+    for pixels, (w, h) in zip(np.split(raw["rgb"], raw["start"][1:]), raw["wh"]):
+        photo = pixels.reshape(h, w, 3)
         thumbs.append(cv2.resize(photo, (side, side), interpolation=cv2.INTER_AREA))
     arrays = [raw[key] for key in Scene._fields[:10]]
     arrays.append(np.stack(thumbs).transpose(0, 3, 1, 2))
@@ -190,7 +187,7 @@ def load_scene(raw, device="cpu"):
     for array in arrays:
         tensor = torch.as_tensor(array, device=device)
         if tensor.is_floating_point():
-            tensor = tensor.to(torch.get_default_dtype())
+            tensor = tensor.float()
         tensors.append(tensor)
     return Scene(*tensors, raw, json.loads(str(raw["info"])))
 
@@ -1115,16 +1112,17 @@ class GeoNVS(nn.Module):
 # ---- 8 Energy ------------------------------------------------------------------------------------
 
 def open_counter(device, rapl="/sys/class/powercap"):
-    """A function that reads joules: of a GPU through NVML (Volta and newer), whatever
-    CUDA_VISIBLE_DEVICES says, or of a CPU's packages, where readable (often by root only)."""
+    """A function that reads joules: of a GPU, or the GPUs of all processes, through NVML (Volta and
+    newer), whatever CUDA_VISIBLE_DEVICES says, or of a CPU's packages, where readable (often by
+    root only)."""
     if device.type == "cuda":
         import pynvml
         pynvml.nvmlInit()
-        uuid = torch.cuda.get_device_properties(device).uuid
-        gpu = pynvml.nvmlDeviceGetHandleByUUID(f"GPU-{uuid}")
-        return lambda: pynvml.nvmlDeviceGetTotalEnergyConsumption(gpu) / 1e3  # mJ
-    if LOCAL_RANK > 0:
-        return lambda: 0.0  # a machine's first process counts its packages
+        gpus = []
+        for number in range(RANKS):
+            uuid = torch.cuda.get_device_properties(number).uuid
+            gpus.append(pynvml.nvmlDeviceGetHandleByUUID(f"GPU-{uuid}"))
+        return lambda: sum(map(pynvml.nvmlDeviceGetTotalEnergyConsumption, gpus)) / 1e3  # mJ
     packages = []  # not their parts, nor the platform
     for domain in Path(rapl).glob("intel-rapl:*"):
         if (domain / "name").read_text().startswith("package"):
@@ -1159,6 +1157,8 @@ class EnergyMeter:
 # ---- 9 Training ----------------------------------------------------------------------------------
 
 REFINE_AT = (0.1, 0.2, 0.3, 0.45, 0.6)  # shares of training at which the octree is refined
+PAUSE = 30  # seconds between lines of the log; a checkpoint is made with each
+START = dict(step=0, refined=0, seconds=0.0, joules=0.0)  # what a run has done so far
 RESULTS = ("checkpoint.pt", "log.jsonl", "metrics.json", "panel.png", "mesh.ply", "film.mp4")
 # torchrun starts RANKS processes. Each draws its own rays, the gradients are averaged, the first
 # process decides, speaks and writes; so all hold the same weights.
@@ -1173,15 +1173,6 @@ def from_first_process(value):
     if RANKS > 1:
         dist.broadcast_object_list(box)
     return box[0]
-
-
-def sum_over_processes(value):
-    """None if one of them has none."""
-    values = [value]
-    if RANKS > 1:
-        values = [None] * RANKS
-        dist.all_gather_object(values, value)
-    return None if None in values else sum(values)
 
 
 def average_gradients(model):
@@ -1214,15 +1205,10 @@ def make_optimizer(model):
     return torch.optim.Adam(model.groups(), **model.adam, fused=True)
 
 
-def fingerprint(scene):
-    """What a checkpoint must share with the scene that it is read for."""
-    return [scene.raw[key].tolist() for key in ("name", "is_test", "scale", "center")]
-
-
 def save_checkpoint(path, model, optimizer, gen, state):
     saved = dict(
         config=asdict(model.cfg),
-        scene=fingerprint(model.scene),
+        scene=model.scene.info,
         octrees=[octree.split_keys for octree in model.octrees],
         model=model.state_dict(),
         optimizer=optimizer.state_dict(),
@@ -1242,8 +1228,7 @@ def read_checkpoint(path, given):
         data_prep.refuse_bomb(path)
         saved = torch.load(path, map_location="cpu", weights_only=True)
         cfg = Config(**saved["config"])
-        numbers = [saved["state"][key] for key in ("step", "refined", "seconds")]
-        check(min(numbers) >= 0 and "joules" in saved["state"], "state")
+        check(saved["state"].keys() == START.keys(), "state")
     except Exception as error:  # a damaged file can fail in any layer: zip, pickle, tensor storage
         raise UserError(f"{path} is damaged, too large for the memory or of another program "
                         f"({type(error).__name__}): train again under another --name") from None
@@ -1253,7 +1238,7 @@ def read_checkpoint(path, given):
 def restore(saved, path, model, gen):
     """Puts a checkpoint's weights into a model and its state into gen; returns its optimiser."""
     try:
-        check(saved["scene"] == fingerprint(model.scene), "another scene or split")
+        check(saved["scene"] == model.scene.info, "another scene or split")
         for octree, keys in zip(model.octrees, saved["octrees"], strict=True):
             octree.build(keys.to(octree.features.device))
         model.load_state_dict(saved["model"])
@@ -1261,8 +1246,6 @@ def restore(saved, path, model, gen):
         optimizer.load_state_dict(saved["optimizer"])
         gen.set_state(saved["generator"])
         return optimizer
-    except torch.OutOfMemoryError:
-        raise
     except Exception as error:  # as in read_checkpoint
         raise UserError(f"{path} does not fit this scene and these settings ({error!r:.90}): use "
                         "flags and kind of device as it was made with, or another --name") from None
@@ -1281,7 +1264,7 @@ def train(cfg, scene, run, saved=None, kind=GeoNVS):
         for name in RESULTS:  # nothing of a former run may be taken for this one's
             (run / name).unlink(missing_ok=True)
         optimizer = make_optimizer(model)
-        state = dict(step=0, refined=0, seconds=0.0, joules=0.0)
+        state = dict(START)
     else:
         optimizer = restore(saved, path, model, gen)
         state = saved["state"]
@@ -1289,12 +1272,11 @@ def train(cfg, scene, run, saved=None, kind=GeoNVS):
         for value in model.state_dict().values():
             dist.broadcast(value, 0)
         gen.manual_seed(cfg.seed + RANK + RANKS * state["step"])  # own rays for each process
-    meter = EnergyMeter(gen.device, state["joules"] if RANK == 0 else 0.0)
+    meter = EnergyMeter(gen.device, state["joules"])
     meter.tick()
     photos = scene.photos(False)
     begin = time.perf_counter() - state["seconds"]
-    next_log = state["seconds"] + 5
-    next_save = state["seconds"] + 60
+    next_log = 0.0
     terms = {}
     while True:
         if RANKS == 1 or state["step"] % 16 == 0:  # processes agree on time now and then
@@ -1302,15 +1284,13 @@ def train(cfg, scene, run, saved=None, kind=GeoNVS):
         done = state["step"] / cfg.steps
         if cfg.minutes > 0:
             done = state["seconds"] / (60 * cfg.minutes)
-        if done >= 1 or state["seconds"] > next_log:
+        is_due = done >= 1 or state["seconds"] >= next_log
+        if RANK == 0 and terms and is_due:
+            next_log = state["seconds"] + PAUSE
             meter.tick()
-            state["joules"] = sum_over_processes(meter.joules)
-            next_log = state["seconds"] + 5
-            if RANK == 0:
-                report(model, run / "log.jsonl", done, state, terms)
-            if RANK == 0 and (done >= 1 or state["seconds"] > next_save):
-                save_checkpoint(path, model, optimizer, gen, state)
-                next_save = state["seconds"] + 60
+            state["joules"] = meter.joules
+            report(model, run / "log.jsonl", done, state, terms)
+            save_checkpoint(path, model, optimizer, gen, state)
         if done >= 1:
             return model, state
         terms = training_step(model, optimizer, photos, state["step"], done, gen)
@@ -1336,8 +1316,7 @@ def report(model, path, done, state, terms):
     line = state | numbers | dict(psnr=psnr(out["rgb"], rays.rgb))
     with open(path, "a") as file:
         print(json.dumps(line), file=file)
-    left = state["seconds"] / 60 * max(0, 1 / max(done, 1e-3) - 1)
-    print(f"  step {state['step']:6d}  psnr {line['psnr']:.2f}  {left:.1f} min left", flush=True)
+    print(f"  {done:4.0%}  step {state['step']}  psnr {line['psnr']:.2f}", flush=True)
 
 
 # ---- 10 Scoring, mesh, pictures ------------------------------------------------------------------
@@ -1399,33 +1378,31 @@ def photo_rays(scene, photo):
 def render_photo(model, scene, photo, code):
     """A photo's view under an appearance code (A,): rgb, truth and normal (H,W,3)."""
     w, h = scene.wh[photo].tolist()
-    rays = photo_rays(scene, photo)
     parts = []
-    for chosen in torch.arange(w * h, device=code.device).split(1024):
-        some = Rays(*[column[chosen] for column in rays])
-        out = model.render(some, code.expand(len(chosen), -1))
-        columns = torch.cat([out["rgb"], some.rgb, out["normal"]], 1)  # (R,9)
-        parts.append(columns)
+    for pixel in torch.arange(w * h, device=code.device).split(1024):
+        rays = make_rays(scene, torch.full_like(pixel, photo), pixel)
+        out = model.render(rays, code.expand(len(pixel), -1))
+        parts.append(torch.cat([out["rgb"], rays.rgb, out["normal"]], 1))  # (R,9)
     picture = torch.cat(parts).reshape(h, w, 9)
     rgb, truth, normal = np.split(picture.cpu().numpy(), 3, axis=2)
     return dict(rgb=rgb, truth=truth, normal=normal)
 
 
 def score(frame, lpips=None):
-    """The right half of a rendered photo [D12] against the truth, both rounded to 8 bits, beside
-    the trivial predictor: the mean colour of each row of the left half. SSIM: Gaussian window of
-    11 px, sigma 1.5, no border. None where a picture is too small."""
+    """The right half of a rendered photo [D12], rounded to 8 bits, against the truth, beside the
+    trivial predictor: the mean colour of each row of the left half. SSIM: Gaussian window of 11 px,
+    sigma 1.5, no border. None where a picture is too small."""
     truth = frame["truth"]
     half = truth.shape[1] // 2
-    want = to_uint8(truth[:, half:]) / 255
-    got = to_uint8(frame["rgb"][:, half:]) / 255
-    flat = to_uint8(truth[:, :half].mean(1, keepdims=True)) / 255
+    want = truth[:, half:]
+    got = to_uint8(frame["rgb"][:, half:]) / np.float32(255)
+    flat = truth[:, :half].mean(1, keepdims=True)
+    side = min(got.shape[:2])
     row = dict(
         psnr=psnr(got, want),
         psnr_floor=psnr(flat, want),
         ssim=None,
         lpips=None)
-    side = min(got.shape[:2])
     if side >= 11:
         ssim = structural_similarity(
             got,
@@ -1433,36 +1410,32 @@ def score(frame, lpips=None):
             channel_axis=2,
             data_range=1,
             gaussian_weights=True,
-            sigma=1.5,
             use_sample_covariance=False)
         row["ssim"] = float(ssim)
     if lpips and side >= 32:
-        batch = torch.tensor(np.stack([got, want])).float()  # (2,H,W,3)
-        a, b = batch.permute(0, 3, 1, 2).split(1)  # (1,3,H,W)
-        row["lpips"] = lpips(a, b, normalize=True).item()
+        a = torch.tensor(got).permute(2, 0, 1)  # (3,H,W)
+        b = torch.tensor(want).permute(2, 0, 1)
+        row["lpips"] = lpips(a[None], b[None], normalize=True).item()
     return row
 
 
 def evaluate(model, scene, lpips=None):
     """Scores of the test photos by the half-image protocol [D12], per photo and on average, None
-    where there are none; the first frames, (photo, title, frame), for the panel."""
+    where there are none; codes (I,A) of all photos, those of test photos fitted."""
     photos = scene.photos(True)  # (B,)
-    codes = [fit_codes(model, scene, some) for some in photos.split(32)]
-    codes = torch.cat(codes)  # (B,A)
+    codes = model.codes().clone()
+    for some in photos.split(32):
+        codes[some] = fit_codes(model, scene, some)
     rows = []
-    frames = []
-    pairs = list(zip(photos.tolist(), codes))
-    for photo, code in progress(pairs, "scoring held-out photos"):
+    for photo in progress(photos.tolist(), "scoring held-out photos"):
+        frame = render_photo(model, scene, photo, codes[photo])
         name = str(scene.raw["name"][photo])
-        frame = render_photo(model, scene, photo, code)
         rows.append(dict(name=name) | score(frame, lpips))
-        if len(frames) < 2:
-            frames.append((photo, f"held out: {name}", frame))
     scores = dict(per_image=rows)
     for key in ("psnr", "psnr_floor", "ssim", "lpips"):
         values = [row[key] for row in rows if row[key] is not None]
         scores[key] = float(np.mean(values)) if values else None
-    return scores, frames
+    return scores, codes
 
 
 @torch.no_grad()
@@ -1512,8 +1485,7 @@ def extract_mesh(model):
         grid.refresh(model.distance, part, n + 1)
     volume = grid.volume[0, 0].cpu().numpy()
     square = np.linspace(-1, 1, n + 1) ** 2
-    radius = np.sqrt(square[:, None, None] + square[:, None] + square)  # (n+1,n+1,n+1)
-    is_inside = radius < 1
+    is_inside = square[:, None, None] + square[:, None] + square < 1  # (n+1,n+1,n+1)
     if len(np.unique(volume[is_inside] < 0)) < 2:
         empty = np.zeros((0, 3))
         return empty, empty, empty
@@ -1532,98 +1504,95 @@ def surface_color(model, x):
     code = mean_code(model).expand(len(x), -1)
     _, geo = model.sdf(x)
     inputs = torch.cat([geo, normal, direction_code(-normal), code], 1)
-    return mixed_precision(model.color, inputs).sigmoid()
+    return model.color(inputs).sigmoid()
 
 
 def write_ply(path, vertices, faces, colors):
-    """Binary PLY; double, as coordinates of a map would lose their metres."""
-    vertex = np.empty(len(vertices), [("x", "<f8", 3), ("color", "u1", 3)])
-    vertex["x"] = vertices
-    vertex["color"] = colors
-    face = np.empty(len(faces), [("count", "u1"), ("index", "<i4", 3)])
-    face["count"] = 3
-    face["index"] = faces
+    """A PLY file of text; nine digits, as coordinates of a map would lose their metres."""
     header = f"""ply
-format binary_little_endian 1.0
-element vertex {len(vertex)}
+format ascii 1.0
+element vertex {len(vertices)}
 property double x
 property double y
 property double z
 property uchar red
 property uchar green
 property uchar blue
-element face {len(face)}
+element face {len(faces)}
 property list uchar int vertex_indices
 end_header
 """
-    data = header.encode() + vertex.tobytes() + face.tobytes()
-    atomic_write(path, lambda part: part.write_bytes(data))
+
+    def write(part):
+        with open(part, "w") as file:
+            file.write(header)
+            np.savetxt(file, np.hstack([vertices, colors]), "%.9g %.9g %.9g %d %d %d")
+            np.savetxt(file, faces, "3 %d %d %d")
+    atomic_write(path, write)
 
 
-def write_panel(path, model, frames, width=240):
-    """A row for each (photo, title, frame): photo, render, normals of the surface and what the
-    mask network says of the photo."""
+def write_panel(path, model, scene, codes, width=240):
+    """A row for two held-out photos and two of training: photo, render under codes (I,A), normals
+    of the surface, and what the mask network says of the photo."""
+    photos = torch.cat([scene.photos(True)[:2], scene.photos(False)[:2]])
     rows = []
-    for photo, title, frame in frames:
-        tiles = {title: frame["truth"], "render": frame["rgb"]}
-        tiles["normals"] = frame["normal"] / 2 + 0.5
+    for photo in photos.tolist():
+        frame = render_photo(model, scene, photo, codes[photo])
+        tiles = [frame["truth"], frame["rgb"], frame["normal"] / 2 + 0.5]
         if model.cfg.mask != "off":
-            M = model.mask.logits([photo]).detach().sigmoid()  # (1,1,m,m)
-            colors = cv2.applyColorMap(to_uint8(M[0, 0].cpu()), cv2.COLORMAP_VIRIDIS)
-            tiles["mask: yellow is transient"] = colors[:, :, ::-1] / 255
+            M = model.mask.logits([photo])[0, 0].detach().sigmoid().cpu()  # (m,m)
+            tiles.append(np.dstack([M, M, M]))
         h, w = frame["rgb"].shape[:2]
         size = (width, width * h // w)
-        row = []
-        for text, tile in tiles.items():
-            tile = cv2.resize(to_uint8(tile), size, interpolation=cv2.INTER_AREA)
-            tile = np.pad(tile, ((20, 4), (0, 4), (0, 0)), constant_values=255)
-            cv2.putText(tile, text, (2, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.4, (0, 0, 0))
-            row.append(tile)
-        rows.append(np.concatenate(row, 1))
-    picture = np.concatenate(rows)[:, :, ::-1]
+        row = [cv2.resize(to_uint8(tile), size, interpolation=cv2.INTER_AREA) for tile in tiles]
+        row = np.pad(np.hstack(row), ((20, 0), (0, 0), (0, 0)), constant_values=255)
+        kind = "held out" if scene.is_test[photo] else "training"
+        text = f"{kind}: {scene.raw['name'][photo]}, render, normals, mask (white: transient)"
+        cv2.putText(row, text, (2, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.4, (0, 0, 0))
+        rows.append(row)
+    picture = np.vstack(rows)[:, :, ::-1]
     atomic_write(path, lambda part: cv2.imwrite(str(part), picture))
 
 
 def finish(model, scene, state, run):
     """Scores a trained model and writes metrics.json, panel.png and mesh.ply below run."""
-    cfg = model.cfg
     device = scene.c2w.device
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024  # before scoring
     machine = f"cpu, {torch.get_num_threads()} threads"
     if device.type == "cuda":
         peak = torch.cuda.max_memory_allocated(device)
         machine = torch.cuda.get_device_name(device)
-    scores, frames = evaluate(model, scene, make_lpips(device))
+    scores, codes = evaluate(model, scene, make_lpips(device))
+    write_panel(run / "panel.png", model, scene, codes)
     if isinstance(model, GeoNVS):
+        level = model.sdf.octree.cells[:, 0]
+        scores["octree_cells"] = level.bincount().tolist()  # by level
         write_ply(run / "mesh.ply", *extract_mesh(model))
         if scene.info["kind"] == "toy":
             scores |= toy_truth(model, scene)
-        for photo in scene.photos(False)[:2].tolist():
-            frame = render_photo(model, scene, photo, model.codes()[photo])
-            frames.append((photo, f"training: {scene.raw['name'][photo]}", frame))
-    write_panel(run / "panel.png", model, frames)
+    joules = state["joules"]
+    is_metered = joules is not None
     parameters = sum(p.numel() for p in model.parameters())
-    cells = [octree.cells[:, 0].bincount().tolist() for octree in model.octrees]  # by level
+    cells = sum(len(octree.cells) for octree in model.octrees)
     here = Path(__file__).parent
     status, commit = subprocess.getstatusoutput(f'git -C "{here}" describe --always --dirty')
     metrics = scores | dict(
         scene=scene.info["scene"],
         method=model.name,
-        seed=cfg.seed,
+        seed=model.cfg.seed,
         steps=state["step"],
         device=machine,
         train_seconds=state["seconds"],
-        energy_wh=state["joules"] and state["joules"] / 3600,
-        energy_source=state["joules"] and "the device's counter, read every 5 s",
-        rays_per_second=state["step"] * cfg.rays / max(state["seconds"], 1e-9),
-        octree_cells=cells[0] if cells else None,
+        energy_wh=joules / 3600 if is_metered else None,
+        energy_source=f"the device's counter, read every {PAUSE} s" if is_metered else None,
+        rays_per_second=state["step"] * model.cfg.rays / state["seconds"],
         parameters=parameters,
-        model_bytes=4 * parameters + 44 * sum(map(sum, cells)),  # a cell: child, 8 corners, 8 flags
+        model_bytes=4 * parameters + 44 * cells,  # a cell: child, 8 corners, 8 flags
         peak_memory_bytes=peak,
         protocol="appearance fitted on the left half, scored on the right half",
         torch=torch.__version__,
         commit=None if status else commit,
-        config=asdict(cfg))
+        config=asdict(model.cfg))
     atomic_write(run / "metrics.json", lambda part: part.write_text(json.dumps(metrics, indent=1)))
     return metrics
 
@@ -1634,34 +1603,24 @@ def in_between(keys, n):
 
 
 def film(model, scene, path):
-    """mp4 at 24 frames/s: past the training cameras, from one end to the other, in the light of
-    their photos."""
+    """mp4 at 24 frames/s: the first training camera sways sideways, by a tenth of the sphere's
+    radius, while the light goes from photo to photo."""
     photos = scene.photos(False)
-    centre = scene.c2w[photos, :, 3]  # (B,3)
-    axis = centre.std(0).argmax()  # along which cameras spread most
-    photos = photos[centre[:, axis].argsort()]
     stops = photos[::math.ceil(len(photos) / 7)]
-    frames = 24 * len(stops)
-    c2w = in_between(scene.c2w[stops].flatten(1), frames).reshape(-1, 3, 4)
-    codes = in_between(model.codes()[stops], frames)  # (n,A)
-    z = F.normalize(c2w[:, :, 2])  # (n,3) forward
-    x = F.normalize(torch.cross(c2w[:, :, 1], z))
-    y = torch.cross(z, x)
-    c2w = torch.stack([x, y, z, c2w[:, :, 3]], 2)  # rotations again
-    middle = stops[len(stops) // 2]
-    wh = scene.wh[middle] // 2 * 2  # codecs want even sides
-    one = scene._replace(
-        wh=wh[None],
-        K=scene.K[middle][None],
-        near=scene.near[photos].min()[None])  # as cameras between the photos may be nearer
+    codes = in_between(model.codes()[stops], 24 * len(stops))  # (n,A)
+    photo = photos[0].item()
+    position = scene.c2w[photo, :, 3]
+    scene = scene._replace(c2w=scene.c2w.clone())
+    camera = scene.c2w[photo]  # (3,4), a part of the copy
+    w, h = (scene.wh[photo] // 2 * 2).tolist()  # codecs want even sides
 
     def write(part):
         codec = cv2.VideoWriter_fourcc(*"mp4v")
-        video = cv2.VideoWriter(str(part), codec, 24, wh.tolist())
-        check(video.isOpened(), "OpenCV cannot write mp4 here")
-        for view, code in progress(list(zip(c2w, codes)), f"filming {frames} frames"):
-            frame = render_photo(model, one._replace(c2w=view[None]), 0, code)
-            video.write(to_uint8(frame["rgb"][:, :, ::-1]))
+        video = cv2.VideoWriter(str(part), codec, 24, (w, h))
+        for n, code in enumerate(progress(codes, f"filming {len(codes)} frames")):
+            camera[:, 3] = position + 0.1 * math.sin(n / 24) * camera[:, 0]
+            frame = render_photo(model, scene, photo, code)
+            video.write(to_uint8(frame["rgb"][:h, :w, ::-1]))
         video.release()
         return part.stat().st_size > 0
     atomic_write(path, write)
@@ -1679,14 +1638,9 @@ def make_parser():
     parser = Parser(
         description=__doc__.split("\n\n")[0],
         epilog=f"[Dn]: see geonvs.py's head. Photos on a GPU: {LARGE}",
-        allow_abbrev=False,
         argument_default=argparse.SUPPRESS)
     for setting in fields(Config):
-        parser.add_argument(
-            f"--{setting.name}",
-            type=setting.type,
-            choices=setting.metadata["choices"],
-            help=f"{setting.metadata['help']} [{setting.default}]")
+        parser.add_argument(f"--{setting.name}", type=setting.type, **setting.metadata)
     parser.add_argument("--resume", action="store_true", help="go on from the run's checkpoint")
     parser.add_argument("--render", action="store_true", help="film a finished run")
     return parser
@@ -1697,19 +1651,18 @@ def pick_device(name):
     count = torch.cuda.device_count()
     if name == "auto":
         name = "cuda" if count > 0 else "cpu"
-    if name == "cuda":
-        name = f"cuda:{LOCAL_RANK}"
-    there = ["cpu"] + [f"cuda:{i}" for i in range(count)]
-    check(name in there, f"--device {name} is not there: this machine has {', '.join(there)}")
-    return torch.device(name)
+    if name == "cpu":
+        return torch.device("cpu")
+    check(LOCAL_RANK < count, f"--device cuda: {count} GPUs are here for {RANKS} processes")
+    return torch.device("cuda", LOCAL_RANK)
 
 
 def make_config(given):
     """Config's defaults, then LARGE if photos meet a GPU, then flags."""
-    is_toy = not given.get("data") and given.get("scene", "toy") == "toy"
-    has_gpu = given.get("device") != "cpu" and torch.cuda.device_count() > 0
-    large = LARGE if has_gpu and not is_toy else {}
-    return Config(**(large | given))
+    cfg = Config(**given)
+    if cfg.source != "toy" and pick_device(cfg.device).type == "cuda":
+        cfg = Config(**(LARGE | given))
+    return cfg
 
 
 def execute(cfg, scene, run, saved=None, kind=GeoNVS):
@@ -1727,7 +1680,6 @@ def execute(cfg, scene, run, saved=None, kind=GeoNVS):
 
 def start_processes(device):
     """Joins the processes that torchrun started; the first one speaks."""
-    check("MASTER_ADDR" in os.environ, "start processes by torchrun, or unset WORLD_SIZE")
     dist.init_process_group("cpu:gloo,cuda:nccl" if device.type == "cuda" else "gloo")
     if RANK > 0:
         sys.stdout = open(os.devnull, "w")
@@ -1738,21 +1690,18 @@ def main(argv=None):
     resume = given.pop("resume", False)
     render = given.pop("render", False)
     cfg = make_config(given)
-    scene_file = data_prep.scene_path(cfg.source)
-    run = Path("runs", cfg.name or f"{scene_file.stem}-{GeoNVS.name}-{cfg.seed}")
-    path = run / "checkpoint.pt"
+    scene_name = data_prep.scene_path(cfg.source).stem
+    run = Path("runs", cfg.name or f"{scene_name}-{GeoNVS.name}-{cfg.seed}")
     saved = None
     if resume or render:
-        saved, cfg = read_checkpoint(path, given)
+        saved, cfg = read_checkpoint(run / "checkpoint.pt", given)
     check(cfg.rays % (cfg.photos * RANKS) == 0,
           f"--rays {cfg.rays} must be a multiple of --photos {cfg.photos} times {RANKS} processes")
     device = pick_device(cfg.device)
     if RANKS > 1:
         start_processes(device)
-    if RANK == 0:
-        data_prep.open_scene(cfg.source, cfg.downscale)  # makes the file
-    from_first_process(None)  # the others wait for it
-    scene = load_scene(data_prep.open_scene(cfg.source, cfg.downscale), device)
+    raw = data_prep.open_scene(cfg.source, cfg.downscale)  # made on first use
+    scene = load_scene(raw, device)
     if render:
         with device:
             model = GeoNVS(cfg, scene)
@@ -1769,18 +1718,15 @@ def run_command_line(entry):
     try:
         entry()
         return
-    except UserError as error:
+    except (UserError, OSError) as error:  # a full disk, a folder without permission
         message = str(error)
     except (RuntimeError, MemoryError) as error:  # a CPU's allocator has no error of its own
-        signs = ("MemoryError", "out of memory", "allocate memory")
-        if not any(sign in repr(error) for sign in signs):
+        if isinstance(error, RuntimeError) and "allocate" not in str(error):
             raise
         message = "the memory is full: begin anew with fewer --rays or a larger --downscale"
-    except OSError as error:  # a full disk, a folder without permission
-        message = f"{error}: free or choose a place, then go on with --resume"
     except KeyboardInterrupt:
-        message = "stopped; --resume goes on from the last checkpoint: training makes one a minute"
-    print(f"error: {message}", file=sys.stderr)
+        message = f"stopped; --resume goes on from the last checkpoint, made every {PAUSE} s"
+    data_prep.warn(f"error: {message}")
     sys.exit(2)
 
 
