@@ -35,7 +35,8 @@ Where the printed paper is departed from, the line carries its tag:
   [D7]  M is learnt by classification. A ray is transient if its error (of the worst channel)
         exceeds its price, which is
         max(upper quartile of errors at SfM pixels + lam_mask, 0.15) + lam_gpl Phi. There is no
-        term for bimodality. Lessons end after 60 % of training
+        term for bimodality. Lessons end after 60 % of training; in the first 30 % such rays
+        teach no colours as soon as M suspects them
   [D8]  the background also fills what lies before the sphere; its last section is opaque
   [D9]  only the colour and background networks have mixed precision: distances stay float32 (the
         mask's convolutions may use TF32)
@@ -123,7 +124,7 @@ class Config:
     lam_sfm: float = opt(7.5e-3, "weight of min(zeta, 40) |s(p)| at SfM points [D10]")
     lam_mask: float = opt(0.04, "error above that of SfM pixels that masks a ray [D7]")
     lr_grid: float = opt(1e-2, "learning rate of octree features and appearance codes")
-    lr_net: float = opt(2e-3, "learning rate of networks")
+    lr_net: float = opt(4e-3, "learning rate of networks")
 
     def __post_init__(self):
         """Refuses numbers that cannot work, before anything is written."""
@@ -850,12 +851,12 @@ def transient_loss(logit, error, price):
     return F.binary_cross_entropy_with_logits(logit, is_transient, weight)
 
 
-def doubted(mask, is_wrong, done):
-    """M (R,), but 1 where an error above its price (is_wrong) confirms what the network suspects.
-    The suspicion has to be stronger from step to step, and this ends after 30 % of training: at
-    first the scene must not learn to paint people, later it must learn its details. [D7]"""
-    is_confirmed = is_wrong & (mask > done / DOUBTED)
-    return torch.where(is_confirmed, 1.0, mask)
+def reject_outliers(mask, is_outlier, done):
+    """M (R,), but 1 for outliers, rays whose error exceeds their price, that the network suspects
+    too. It has to suspect them more from step to step, and after 30 % of training M alone counts:
+    at first the scene must not learn to paint people, later it must learn its details. [D7]"""
+    suspicion = (done / REJECTING) ** 2
+    return torch.where(is_outlier & (mask > suspicion), 1.0, mask)
 
 
 def follow_quantiles(running, shares, values, is_chosen, rate=0.1):
@@ -867,7 +868,7 @@ def follow_quantiles(running, shares, values, is_chosen, rate=0.1):
     running *= torch.exp(rate * excess)
 
 
-DOUBTED = 0.3  # share of training in which an error of a ray confirms a suspicion of the mask
+REJECTING = 0.3  # share of training in which outliers are rejected
 LEAST_PRICE = 0.15  # error of a ray below which it is never transient
 TAUGHT = 0.6  # share of training in which the mask learns; later it would give up people
 
@@ -998,7 +999,7 @@ class GeoNVS(nn.Module):
             dynamic = error * ~is_static  # (R,) SfM pixels: M = 0 [D10]
             if done < TAUGHT:
                 l_mask = transient_loss(logit, dynamic, price)
-            mask = doubted(mask, dynamic > price, done)
+            mask = reject_outliers(mask, dynamic > price, done)
 
         which = random_index(gen, cfg.samples + 1, R)
         t = out["t"].gather(1, which[:, None])  # (R,1)
@@ -1692,9 +1693,10 @@ def main(argv=None):
     cfg = make_config(given)
     scene_name = data_prep.scene_path(cfg.source).stem
     run = Path("runs", cfg.name or f"{scene_name}-{GeoNVS.name}-{cfg.seed}")
+    path = run / "checkpoint.pt"
     saved = None
     if resume or render:
-        saved, cfg = read_checkpoint(run / "checkpoint.pt", given)
+        saved, cfg = read_checkpoint(path, given)
     check(cfg.rays % (cfg.photos * RANKS) == 0,
           f"--rays {cfg.rays} must be a multiple of --photos {cfg.photos} times {RANKS} processes")
     device = pick_device(cfg.device)
