@@ -1120,7 +1120,7 @@ def open_counter(device, rapl="/sys/class/powercap"):
         import pynvml
         pynvml.nvmlInit()
         gpus = []
-        for number in range(RANKS):
+        for number in range(device.index, device.index + RANKS):  # this is the first process's
             uuid = torch.cuda.get_device_properties(number).uuid
             gpus.append(pynvml.nvmlDeviceGetHandleByUUID(f"GPU-{uuid}"))
         return lambda: sum(map(pynvml.nvmlDeviceGetTotalEnergyConsumption, gpus)) / 1e3  # mJ

@@ -2527,8 +2527,11 @@ def test_rapl_sums_packages_without_their_parts_and_the_platform(tmp_path):
     assert counter() == 2.0
 
 
-@pytest.mark.parametrize("processes, joules", [(1, 7.0), (2, 9.0)])
-def test_nvml_is_asked_for_the_gpus_that_torch_uses(monkeypatch, processes, joules):
+@pytest.mark.parametrize("device, processes, joules", [
+    ("cuda:0", 1, 7),
+    ("cuda:1", 1, 2),
+    ("cuda:0", 2, 9)])
+def test_nvml_is_asked_for_the_gpus_that_torch_uses(monkeypatch, device, processes, joules):
     millijoules = {"GPU-0": 7000, "GPU-1": 2000}
     nvml = SimpleNamespace(
         nvmlInit=lambda: None,
@@ -2538,7 +2541,7 @@ def test_nvml_is_asked_for_the_gpus_that_torch_uses(monkeypatch, processes, joul
     monkeypatch.setattr(geonvs, "RANKS", processes)
     monkeypatch.setattr(
         torch.cuda, "get_device_properties", lambda number: SimpleNamespace(uuid=number))
-    counter = geonvs.open_counter(torch.device("cuda"))
+    counter = geonvs.open_counter(torch.device(device))
     assert counter() == joules
 
 
