@@ -122,11 +122,10 @@ def write_scene(path, scene):
 
 
 def refuse_bomb(path):
-    """Raises BadZipFile for what is no zip file, or larger inside than outside: ours never are."""
+    """UserError for a zip file that is larger inside than outside: ours never are."""
     with zipfile.ZipFile(path) as file:
         inside = sum(member.file_size for member in file.infolist())
-        if inside > os.path.getsize(path):
-            raise zipfile.BadZipFile(f"{path} is larger inside than outside")
+        check(inside <= os.path.getsize(path), f"{path} is larger inside than outside")
 
 
 def check_scene(scene):
@@ -221,34 +220,37 @@ LANDMARK = table("""
 """)
 LANDMARK[2:8, 1] = np.linspace(-.54, .60, 6)   # the columns stand in a row
 GROUPS = (2, 16), (11, 16), (16, 19), (19, 21), (21, 24)   # on the plinth; of it the dome; ...
-# The background: the ground, and houses, each with a roof and a tree before it.
+# The background: the ground, houses, each with a roof, and trees.
 TOWN = table("""
-    0      0     0     0     1    1    1    1  10
-    1   -7.5     2   .75   .75   .6   .6   .6   8
-    1   -7.5     2  1.75   .25   .6    0   .6   5
-    3     -5   1.4   .68   .48  .48  .48  .48   9
-    1   -6.2   4.4   .55   .55   .5   .5   .5   8
-    1   -6.2   4.4  1.35   .25   .5    0   .5   5
-    3  -3.96  3.08    .6    .4   .4   .4   .4   9
-    1     -4   6.4    .9    .9   .8   .8   .8   8
-    1     -4   6.4  2.05   .25   .8    0   .8   5
-    3   -2.2  4.48   .84   .64  .64  .64  .64   9
-    1   -1.2   7.6  1.15  1.15   .5   .5   .5   8
-    1   -1.2   7.6  2.55   .25   .5    0   .5   5
-    3    .04  5.32    .6    .4   .4   .4   .4   9
-    1      2   6.8    .7    .7   .7   .7   .7   8
-    1      2   6.8  1.65   .25   .7    0   .7   5
-    3    2.6  4.76   .76   .56  .56  .56  .56   9
-    1    4.6   5.6   .95   .95   .5   .5   .5   8
-    1    4.6   5.6  2.15   .25   .5    0   .5   5
-    3   4.68  3.92    .6    .4   .4   .4   .4   9
-    1    6.8     3   .65   .65   .6   .6   .6   8
-    1    6.8     3  1.55   .25   .6    0   .6   5
-    3   6.44   2.1   .68   .48  .48  .48  .48   9
-    1    7.4     0   .85   .85   .5   .5   .5   8
-    1    7.4     0  1.95   .25   .5    0   .5   5
-    3   6.92     0    .6    .4   .4   .4   .4   9
+    0     0    0     0     1   1   1   1  10
+    1  -7.5    2   .75   .75  .6  .6  .6   8
+    1  -7.5    2  1.75   .25  .6   0  .6   5
+    1  -6.2  4.4   .55   .55  .5  .5  .5   8
+    1  -6.2  4.4  1.35   .25  .5   0  .5   5
+    1    -4  6.4    .9    .9  .8  .8  .8   8
+    1    -4  6.4  2.05   .25  .8   0  .8   5
+    1  -1.2  7.6  1.15  1.15  .5  .5  .5   8
+    1  -1.2  7.6  2.55   .25  .5   0  .5   5
+    1     2  6.8    .7    .7  .7  .7  .7   8
+    1     2  6.8  1.65   .25  .7   0  .7   5
+    1   4.6  5.6   .95   .95  .5  .5  .5   8
+    1   4.6  5.6  2.15   .25  .5   0  .5   5
+    1   6.8    3   .65   .65  .6  .6  .6   8
+    1   6.8    3  1.55   .25  .6   0  .6   5
+    1   7.4    0   .85   .85  .5  .5  .5   8
+    1   7.4    0  1.95   .25  .5   0  .5   5
+    3  -7.5    2    .6    .6  .6  .6  .6   9
+    3  -6.2  4.4    .5    .5  .5  .5  .5   9
+    3    -4  6.4    .8    .8  .8  .8  .8   9
+    3  -1.2  7.6    .5    .5  .5  .5  .5   9
+    3     2  6.8    .7    .7  .7  .7  .7   9
+    3   4.6  5.6    .5    .5  .5  .5  .5   9
+    3   6.8    3    .6    .6  .6  .6  .6   9
+    3   7.4    0    .5    .5  .5  .5  .5   9
 """)
+TREES = TOWN[17:]   # yet with place and half width of the house that one stands before
+TREES[:, 3:8] *= .8
+TREES[:, 1:4] = TREES[:, 1:4] * (.8, .7, 1) + (1, 0, .2)
 
 
 def toy_parts(landmark, background):
@@ -706,8 +708,8 @@ def read_photos(sparse):
     read = open_binary(sparse / "cameras.bin")
     for _ in range(*read("Q")):
         key, model, *wh = read("IiQQ")
-        is_known = 0 <= model < len(PARAMETERS)
-        check(is_known, f"{sparse} has camera model {model}: run colmap image_undistorter")
+        check(0 <= model < len(PARAMETERS),
+              f"{sparse} has camera model {model}, which is unknown: run colmap image_undistorter")
         numbers = array(read(f"{PARAMETERS[model]}d"))
         if model in FOCAL_LENGTHS:
             n = FOCAL_LENGTHS[model]
@@ -721,8 +723,8 @@ def read_photos(sparse):
         (count,) = read("Q")
         ids = read(f"{3 * count}Q")[2::3]   # of u, v, point
         places = name.replace("\\", "/").split("/")
-        is_sound = name not in photos and not {"", ".."} & set(places)
-        check(is_sound, f"{sparse}: photo {name!r} occurs twice or lies outside: rename it")
+        check(name not in photos and not {"", ".."} & set(places),
+              f"{sparse}: photo {name!r} occurs twice or lies outside the image folder: rename it")
         photos[name] = cameras.get(camera), array(pose), ids
     return photos
 
@@ -758,8 +760,8 @@ def read_points(sparse):
     points = array(points, float).reshape(-1, 5)
     is_sound = (abs(points) < FAR).all(1)   # false for nan
     points[~is_sound] = 0   # nobody sees them
-    has_tracks = (points[:, 4] > 1).any()
-    check(has_tracks, f"no point of {sparse} has a track: run colmap point_triangulator on it")
+    check((points[:, 4] > 1).any(),
+          f"no point of {sparse} has a track: run colmap point_triangulator on it")
     return points, rows
 
 
@@ -768,16 +770,9 @@ def photo_files(folder):
     files = {}
     for path in sorted(folder.rglob("[!.]*")):
         name = path.relative_to(folder)
-        is_photo = path.suffix.lower() in PHOTO_TYPES
-        if is_photo and name.parts[0] != "dense":
+        if path.suffix.lower() in PHOTO_TYPES and name.parts[0] != "dense":
             files[name.as_posix()] = path
     return files
-
-
-def renamed(name, others):
-    """Says which of the others the name means, if folder or extension alone differ."""
-    same = [other for other in others if Path(other).stem == Path(name).stem]
-    return f"; {same[0]} has another folder or extension" if same else ""
 
 
 def model_folders(folder):
@@ -812,7 +807,7 @@ def find_model(folder, command):
     best = max(models, key=lambda model: model.count)
     check(best.names, f"no photo of {best.sparse} is on disk, such as {sorted(best.photos)[:1]}: "
           f"put them into {folder}/images, or run python data_prep.py {command}")
-    on_disk = max(len(model.files) for model in models if model.names)
+    on_disk = max(len(model.files) for model in models)
     print(f"{best.images}: {on_disk} photos on disk, {len(best.names)} posed by {best.sparse}")
     for model in models:
         if model.photos.keys() != best.photos.keys():
@@ -936,7 +931,8 @@ def read_usable(model, held_out, downscale):
     for name in progress(sorted(held_out), "preparing photos"):
         try:
             if name not in model.names:
-                raise UserError(f"has no pose or no file{renamed(name, model.names)}")
+                same = [other for other in model.names if Path(other).stem == Path(name).stem]
+                raise UserError(f"has no pose or no file; of other folder or extension: {same}")
             camera, pose, ids = model.photos[name]
             check_photo(camera, pose, held_out[name])
             image, K = read_photo(model.files[name], camera, downscale)
@@ -974,22 +970,18 @@ def prepare(name, downscale=2, split=None):
         own = [rows[key] for key in own if key in rows]
         tracks.append(array(own, int))
     scene = finish(images, K, c2w, is_test, list(usable), points, tracks, info)
-    check_sightings(scene["track_uv"])
+    uv = scene["track_uv"]
+    share = (abs(uv - .5) <= .5).all(1).mean()
+    says = f"only {share:.0%} of all sightings of points fall into the photo that saw them"
+    is_sound = share >= .5 and np.std(uv) > .02   # points in smaller units lie in the middle
+    check(is_sound, f"{says}: give poses as COLMAP does, world to camera, x right, y down, "
+          "z forward, in the units of the points")
+    if share < .9:
+        warn(says)
     is_inside = norm(scene["points"], axis=1) < 1
     print(f"the sphere has a radius of {scene['scale']:.3g} units of the reconstruction; "
           f"{is_inside.mean():.0%} of the points are inside")
     return scene
-
-
-def check_sightings(uv):
-    """UserError if points (T,2) seldom fall into 0..1, the photo that saw them, or all into its
-    middle: then points have smaller units than poses."""
-    share = (abs(uv - .5) <= .5).all(1).mean()
-    says = f"only {share:.0%} of all sightings of points fall into the photo that saw them"
-    check(share >= .5 and np.std(uv) > .02, f"{says}: give poses as COLMAP does, world to camera, "
-          "x right, y down, z forward, in the units of the points")
-    if share < .9:
-        warn(says)
 
 
 def scene_path(name_or_folder):
@@ -1041,8 +1033,7 @@ def fetch(url, path):
                 file.truncate(have)
                 for _ in progress(range(have, total, 1 << 20), f"MiB of {path.name}"):
                     have += file.write(answer.read(1 << 20))
-        if have != total:
-            raise OSError("it ended early")
+        check(have == total, "it ended early")
         os.replace(part, path)
     except Exception as e:   # of the disk, the network or its protocol
         if getattr(e, "code", 0) == 416:   # longer than the file itself
@@ -1061,7 +1052,7 @@ def unpack(archive, wanted, folder):
             pass
 
 
-def download(name, archive_url=ARCHIVE_URL, split_url=SPLIT_URL):
+def download(name):
     """Photos and reconstruction of one of SCENES, with its split file -> data/<name>/"""
     check(name in SCENES, f"--download knows {', '.join(SCENES)}, not {name}")
     scene, table = SCENES[name]
@@ -1069,8 +1060,8 @@ def download(name, archive_url=ARCHIVE_URL, split_url=SPLIT_URL):
     table = DATA / table
     archive = DATA / f"{scene}.tar.gz"
     check(not home.exists(), f"{home} is there already: move it, or leave --download out")
-    fetch(split_url + table.name, table)
-    fetch(archive_url + archive.name, archive)
+    fetch(SPLIT_URL + table.name, table)
+    fetch(ARCHIVE_URL + archive.name, archive)
     try:
         with tempfile.TemporaryDirectory(dir=DATA) as temporary:
             unpack(archive, (f"{scene}/dense/images/", f"{scene}/dense/sparse/"), temporary)
