@@ -679,7 +679,7 @@ def statistics(scene):
 
 
 # ---- folders with photos and COLMAP models -------------------------------------------------------
-PHOTO_TYPES = ".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"
+PHOTO_TYPES = ".jpg .jpeg .png .tif .tiff .bmp .webp .ppm .pgm .jp2 .avif .heic".split()
 # By COLMAP's number of a camera model: how many numbers it has; and how many focal lengths, which
 # come first, before centre and distortion.
 PARAMETERS = table("3 4 4 5 8 8 12 5 4 5 12 16 4 5 3 4 6 2").astype(int)
@@ -697,7 +697,7 @@ def open_binary(path):
             record = struct.Struct("<" + layout)
             return record.unpack(file.read(record.size))
         except struct.error as e:   # too few bytes are left, or none could be enough
-            raise UserError(f"{path} ends too early: copy or export it again") from e
+            raise UserError(f"{path} ends too early: copy it again, or delete its folder") from e
     return read
 
 
@@ -719,11 +719,10 @@ def read_photos(sparse):
     for _ in range(*read("Q")):
         _, *pose, camera = read("I7dI")
         letters = iter(lambda: read("c")[0], b"\0")
-        name = b"".join(letters).decode(errors="replace")
+        name = b"".join(letters).decode(errors="replace").replace("\\", "/")   # of Windows
         (count,) = read("Q")
         ids = read(f"{3 * count}Q")[2::3]   # of u, v, point
-        places = name.replace("\\", "/").split("/")
-        check(name not in photos and not {"", ".."} & set(places),
+        check(name not in photos and not {"", ".."} & set(name.split("/")),
               f"{sparse}: photo {name!r} occurs twice or lies outside the image folder: rename it")
         photos[name] = cameras.get(camera), array(pose), ids
     return photos
@@ -765,22 +764,22 @@ def read_points(sparse):
     return points, rows
 
 
+def below(folder, name):
+    """Paths of that name, at most six levels down; links are followed, unlike by rglob."""
+    found = []
+    for depth in range(7):
+        found += sorted(folder.glob("*/" * depth + name))
+    return found
+
+
 def photo_files(folder):
     """{name: path} of the photos below a folder; dense/ holds copies of those outside it."""
     files = {}
-    for path in sorted(folder.rglob("[!.]*")):
+    for path in below(folder, "[!.]*"):
         name = path.relative_to(folder)
         if path.suffix.lower() in PHOTO_TYPES and name.parts[0] != "dense":
             files[name.as_posix()] = path
     return files
-
-
-def model_folders(folder):
-    """Folders with COLMAP models, at most four levels down; links are followed."""
-    found = []
-    for depth in range(5):
-        found += sorted(folder.glob("*/" * depth + "images.bin"))
-    return [path.parent for path in found]
 
 
 def open_model(folder, sparse):
@@ -801,12 +800,15 @@ def open_model(folder, sparse):
 
 def find_model(folder, command):
     """The model in the folder with most photos; says what that leaves out."""
-    models = [open_model(folder, place) for place in model_folders(folder)]
+    models = [open_model(folder, path.parent) for path in below(folder, "images.bin")]
     check(models, f"{folder} has no binary COLMAP model: run python data_prep.py {command}, or for "
           "a text model colmap model_converter --output_type BIN")
     best = max(models, key=lambda model: model.count)
-    check(best.names, f"no photo of {best.sparse} is on disk, such as {sorted(best.photos)[:1]}: "
-          f"put them into {folder}/images, or run python data_prep.py {command}")
+    lost = sorted(best.photos.keys() - best.files)
+    says = f"{len(lost)} photos of {best.sparse} are not on disk, such as {lost[:1]}"
+    check(best.names, f"{says}: put them into {folder}/images, or run python data_prep.py {command}")
+    if lost:
+        warn(says)
     on_disk = max(len(model.files) for model in models)
     print(f"{best.images}: {on_disk} photos on disk, {len(best.names)} posed by {best.sparse}")
     for model in models:
@@ -862,8 +864,8 @@ def fingerprint(info):
     """Of names, sizes and times of all files that a scene is read from."""
     folder = Path(info["folder"])
     paths = [*photo_files(Path(info["images"])).values(), *folder.glob("*.*")]
-    for place in model_folders(folder):
-        paths += place.glob("*.bin")
+    for path in below(folder, "images.bin"):
+        paths += path.parent.glob("*.bin")
     if info["split"]:
         paths.append(Path(info["split"]))
     checksum = 0
@@ -886,7 +888,7 @@ def decode(path):
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error:   # empty, or more than a gigapixel
         image = None
-    check(image is not None, "is empty, damaged, too large or no photo: replace it")
+    check(image is not None, "is empty, damaged, too large or no photo of a known type: replace it")
     return image
 
 
@@ -1078,6 +1080,7 @@ def run_sfm(folder):
     database = folder / "database.db"
     models = folder / "models"
     dense = folder / "dense"
+    photos = next(folder.glob("images"), folder)   # beside it lie smaller copies and masks
     check(folder.is_dir() and not dense.exists(),
           f"{folder} is missing, or has dense/: delete that")
     models.mkdir(exist_ok=True)
@@ -1087,12 +1090,12 @@ def run_sfm(folder):
     features.sift.domain_size_pooling = True
     matching = pycolmap.FeatureMatchingOptions()
     matching.guided_matching = True
-    pycolmap.extract_features(database, folder, extraction_options=features)
+    pycolmap.extract_features(database, photos, extraction_options=features)
     pycolmap.match_exhaustive(database, matching_options=matching)
-    found = pycolmap.incremental_mapping(database, folder, models)
+    found = pycolmap.incremental_mapping(database, photos, models)
     check(found, f"the photos in {folder} do not match each other; take more, with more overlap")
     best = max(found, key=lambda i: found[i].num_reg_images())
-    pycolmap.undistort_images(dense, models / str(best), folder)
+    pycolmap.undistort_images(dense, models / str(best), photos)
 
 
 def main(argv=None):

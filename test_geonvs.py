@@ -969,6 +969,34 @@ def test_of_several_models_the_largest_is_taken_and_the_others_are_named(model):
     assert "4 posed by place/dense/sparse/1" in out
 
 
+def test_photos_are_found_behind_links_and_by_any_usual_type(desk, source):
+    source = source | dict(name=np.array([f"cam/{i}.ppm" for i in range(len(source["name"]))]))
+    write_folder(Path("place"), source)
+    shutil.move(IMAGES / "cam", "elsewhere")
+    (IMAGES / "cam").symlink_to(Path("elsewhere").resolve())
+    assert run_main("place", "--downscale", 1)[0] == 0
+    assert same(data_prep.open_scene("place", 1), source, "rgb", "name")
+
+
+def test_posed_photos_that_are_not_on_disk_are_counted(model):
+    (IMAGES / "toy_003.png").unlink()
+    code, out, err = run_main("place")
+    assert code == 0
+    assert "1 photos of place/dense/sparse are not on disk, such as ['toy_003.png']" in err
+
+
+def test_names_that_windows_wrote_are_read(model, source):
+    for image in model.images.values():
+        image.name = f"cam\\{image.name}"
+    write_model(SPARSE, model)
+    IMAGES.rename("cam")
+    IMAGES.mkdir()
+    shutil.move("cam", IMAGES)
+    Path("place/toy.tsv").unlink()
+    scene = data_prep.open_scene("place", 1)
+    assert scene["name"].tolist() == [f"cam/{name}" for name in sorted(source["name"])]
+
+
 def test_of_equal_models_one_that_can_be_used_is_taken_without_a_word(model):
     shutil.copytree(IMAGES, "place/raw/images")
     write_model(Path("place/raw/sparse"), model)
@@ -1178,8 +1206,9 @@ def test_a_toy_stays_as_it_was_made(desk, monkeypatch):
     Path("toy.tsv").write_text("no business of the toy")
     assert same(data_prep.open_scene("toy", 3), toy(seed=1))
     Path("data/toy.npz").unlink()
-    monkeypatch.setattr(data_prep, "make_toy", toy)
-    assert same(data_prep.open_scene("toy", 3), toy())
+    made = toy()
+    monkeypatch.setattr(data_prep, "make_toy", lambda: made)
+    assert same(data_prep.open_scene("toy", 3), made)
 
 
 @pytest.mark.parametrize("home", ["data/sacre", "data/sacre_coeur"])
@@ -1408,17 +1437,18 @@ def pycolmap(desk, monkeypatch, source):
 
 
 def test_sfm_calls_pycolmap_in_order_and_undistorts_the_largest_model(pycolmap):
-    photos = pycolmap.photos
-    database = photos / "database.db"
-    models = photos / "models"
-    assert run_main(photos, "--sfm")[0] == 0
-    assert data_prep.scene_path(photos).exists()
+    folder = pycolmap.photos
+    photos = folder / "images"   # smaller copies may lie beside it
+    database = folder / "database.db"
+    models = folder / "models"
+    assert run_main(folder, "--sfm")[0] == 0
+    assert data_prep.scene_path(folder).exists()
     assert [call[:2] for call in pycolmap.method_calls if call[1]] == [
         ("extract_features", (database, photos)),
         ("match_exhaustive", (database,)),
         ("incremental_mapping", (database, photos, models)),
-        ("undistort_images", (photos / "dense", models / "1", photos))]
-    assert "has dense/" in run_main(photos, "--sfm")[2]   # its photos would be posed twice
+        ("undistort_images", (folder / "dense", models / "1", photos))]
+    assert "has dense/" in run_main(folder, "--sfm")[2]   # its photos would be posed twice
 
 
 def test_sfm_says_when_photos_do_not_match_and_when_pycolmap_is_missing(pycolmap, monkeypatch):
