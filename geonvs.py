@@ -667,10 +667,10 @@ def contract(x):
 
 class Background(nn.Module):
     """A small NeRF before the sphere and beyond it, on an octree over contracted space."""
-    def __init__(self, points, hidden, per_ray):
+    def __init__(self, points, hidden, per_ray, levels):
         super().__init__()
-        self.octree = Octree(2.0, levels=3, root=32)
-        seed_octree(self.octree, contract(points), dense=0, near=2)  # SfM points (K,3)
+        self.octree = Octree(2.0, levels, root=32)
+        seed_octree(self.octree, contract(points), dense=0, near=levels - 1)  # SfM points (K,3)
         features = self.octree.features.shape[1] * self.octree.levels
         self.density = mlp(3 + features, hidden, 1 + GEO)
         self.color = mlp(GEO + per_ray, hidden, 3)
@@ -956,7 +956,8 @@ class GeoNVS(nn.Module):
         self.bg_color = constant(*np.nan_to_num(raw["bg_color"], nan=0.5).tolist())
         has_colors = bool(np.isnan(raw["bg_color"]).any())
         if is_on(cfg.background, has_colors):
-            self.background = Background(scene.points[~is_inside], cfg.hidden, 9 + A)
+            points = scene.points[~is_inside]
+            self.background = Background(points, cfg.hidden, 9 + A, min(levels, 4))
             self.octrees.append(self.background.octree)
         self.deviation = Deviation()
         self.mask = TransientMask(scene)
