@@ -1480,12 +1480,16 @@ def toy_truth(model, scene):
 def extract_mesh(model):
     """The surface s = 0, cut open at the unit sphere, by marching cubes with two cells per finest
     octree cell, at most 512: vertices (P,3) in SfM units, faces (F,3), colours (P,3) uint8 as seen
-    along the normals under the mean code."""
+    along the normals under the mean code. s is evaluated near the surface; elsewhere the cache
+    gives its sign."""
     n = min(round(2 / model.eps), 512)
-    grid = SDFCache(n + 1).to(model.cache.volume)
-    for part in range(n + 1):
-        grid.refresh(model.distance, part, n + 1)
-    volume = grid.volume[0, 0].cpu().numpy()
+    cache = model.cache.volume
+    size = [n + 1] * 3
+    volume = F.interpolate(cache, size=size, mode="trilinear", align_corners=True)[0, 0]
+    near = volume.abs() < 6 / cache.shape[-1]
+    x = near.nonzero() * (2 / n) - 1  # (P,3)
+    volume[near] = in_chunks(model.distance, x)
+    volume = volume.cpu().numpy()
     square = np.linspace(-1, 1, n + 1) ** 2
     is_inside = square[:, None, None] + square[:, None] + square < 1  # (n+1,n+1,n+1)
     if len(np.unique(volume[is_inside] < 0)) < 2:
@@ -1493,7 +1497,7 @@ def extract_mesh(model):
         return empty, empty, empty
     vertices, faces, _, _ = marching_cubes(volume, 0, mask=is_inside)
     vertices = vertices * (2 / n) - 1
-    x = torch.tensor(vertices, dtype=torch.float32, device=grid.volume.device)
+    x = torch.tensor(vertices, dtype=torch.float32, device=cache.device)
     colors = in_chunks(lambda part: surface_color(model, part), x)
     raw = model.scene.raw
     return vertices * raw["scale"] + raw["center"], faces, to_uint8(colors.cpu())
