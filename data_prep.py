@@ -806,7 +806,8 @@ def find_model(folder, command):
     best = max(models, key=lambda model: model.count)
     lost = sorted(best.photos.keys() - best.files)
     says = f"{len(lost)} photos of {best.sparse} are not on disk, such as {lost[:1]}"
-    check(best.names, f"{says}: put them into {folder}/images, or run python data_prep.py {command}")
+    check(best.names,
+          f"{says}: put them into {folder}/images, or run python data_prep.py {command}")
     if lost:
         warn(says)
     on_disk = max(len(model.files) for model in models)
@@ -888,7 +889,8 @@ def decode(path):
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error:   # empty, or more than a gigapixel
         image = None
-    check(image is not None, "is empty, damaged, too large or no photo of a known type: replace it")
+    check(image is not None,
+          "is empty, damaged, too large or no photo of a known type: replace it")
     return image
 
 
