@@ -1229,6 +1229,7 @@ def read_checkpoint(path, given):
     try:
         data_prep.refuse_bomb(path)
         saved = torch.load(path, map_location="cpu", weights_only=True)
+        check(isinstance(saved, dict), "no dictionary")
         cfg = Config(**saved["config"])
         check(saved["state"].keys() == START.keys(), "state")
     except Exception as error:  # a damaged file can fail in any layer: zip, pickle, tensor storage
@@ -1686,6 +1687,7 @@ def execute(cfg, scene, run, saved=None, kind=GeoNVS):
 
 def start_processes(device):
     """Joins the processes that torchrun started; the first one speaks."""
+    check("MASTER_ADDR" in os.environ, "start processes by torchrun, or unset WORLD_SIZE")
     dist.init_process_group("cpu:gloo,cuda:nccl" if device.type == "cuda" else "gloo")
     if RANK > 0:
         sys.stdout = open(os.devnull, "w")
@@ -1701,6 +1703,8 @@ def main(argv=None):
     path = run / "checkpoint.pt"
     saved = None
     if resume or render:
+        if "steps" in given:
+            given.setdefault("minutes", 0.0)  # of two budgets the last one given
         saved, cfg = read_checkpoint(path, given)
     check(cfg.rays % (cfg.photos * RANKS) == 0,
           f"--rays {cfg.rays} must be a multiple of --photos {cfg.photos} times {RANKS} processes")

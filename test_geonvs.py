@@ -3109,8 +3109,8 @@ def test_one_command_trains_scores_and_writes_everything(command, monkeypatch):
 
 def test_resume_goes_on_with_the_runs_own_settings_and_those_given(command, monkeypatch):
     monkeypatch.setattr(geonvs, "finish", lambda *args: {})
-    command(*FLAGS, "--mask=on")
-    assert command("--resume", "--name=a", "--steps=8") == (0, "")
+    command(*FLAGS, "--mask=on", "--minutes=1e-4")
+    assert command("--resume", "--name=a", "--steps=8") == (0, "")  # the last budget counts
     saved = read_saved(RUN)
     assert saved["config"] == asdict(tiny(name="a", mask="on", steps=8))
     assert saved["state"]["step"] == 8
@@ -3184,8 +3184,10 @@ def test_a_fault_of_the_program_keeps_its_traceback():
         geonvs.run_command_line(fail)
 
 
-def test_processes_must_share_the_rays_evenly(command, monkeypatch):
+def test_processes_must_come_from_torchrun_and_share_the_rays(command, monkeypatch):
     monkeypatch.setattr(geonvs, "RANKS", 2)
+    monkeypatch.delenv("MASTER_ADDR", raising=False)
+    assert_refused(command(*FLAGS), "torchrun")
     assert_refused(command(*FLAGS, "--rays=4"), "2 processes")
 
 
