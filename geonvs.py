@@ -947,6 +947,8 @@ class GeoNVS(nn.Module):
         self.color = nn.Sequential(
             LipschitzLinear(GEO + self.sdf.features + 3 + 9 + A, cfg.hidden),
             nn.ReLU(),
+            LipschitzLinear(cfg.hidden, cfg.hidden),
+            nn.ReLU(),
             LipschitzLinear(cfg.hidden, 3))
         self.appearance = nn.Embedding(len(scene.wh), A)
         self.appearance.requires_grad_(A > 0)
