@@ -44,8 +44,8 @@ Where the printed paper is departed from, the line carries its tag:
         while zeta is below 40: a strong pull would leave the surface fog
   [D11] samples are drawn from a cached SDF volume; no second network pass along the ray
   [D12] a test photo's code is fitted on its left half, its score is taken on the right half
-  [D13] derivatives are differences between four taps, around the ray's end and around one random
-        sample of it; all samples of a ray give the colour network the normal of the ray's end
+  [D13] derivatives are differences between four taps, around the ray's end and, on every second
+        ray, around a random sample; all samples give the colour network the normal of the end
   [D14] zeta stays above a rising floor, so that no surface stays fog, and below a fixed bound
   [D15] cells split where colours err and merge far from surfaces; a scene that needs no codes, no
         mask or no background field is modelled without
