@@ -977,7 +977,9 @@ def prepare(name, downscale=2, split=None):
     uv = scene["track_uv"]
     share = (abs(uv - .5) <= .5).all(1).mean()
     says = f"only {share:.0%} of all sightings of points fall into the photo that saw them"
-    is_sound = share >= .5 and np.std(uv) > .02   # points in smaller units lie in the middle
+    photo = scene["track_photo"]
+    spread = median([np.std(uv[photo == i], axis=0).max() for i in np.unique(photo)])
+    is_sound = share >= .5 and spread > .02   # points in smaller units lie close together
     check(is_sound, f"{says}: give poses as COLMAP does, world to camera, x right, y down, "
           "z forward, in the units of the points")
     if share < .9:

@@ -1056,6 +1056,16 @@ def test_poses_that_contradict_the_photos_are_refused_if_many_and_said_if_few(
     assert bool(err) == bool(says)
 
 
+def test_points_in_smaller_units_than_poses_are_refused(model):
+    centre = np.mean([p.x for p in model.points], axis=0)
+    for p in model.points:
+        p.x = centre + (p.x - centre) / 1000
+    write_model(SPARSE, model)
+    code, out, err = run_main("place")
+    assert code == 2
+    assert "in the units of the points" in err
+
+
 def test_the_radius_of_the_sphere_and_the_share_of_points_inside_are_printed(model):
     code, out, err = run_main("place")
     scene = data_prep.open_scene("place")
@@ -1101,7 +1111,7 @@ def test_the_table_of_a_folder_is_used_and_named(model, name):
     rows = [f"toy_00{i}.png;{'test' if i == 5 else 'train'}" for i in range(9)]
     Path("place", name).write_text("filename;split\n" + "\n".join(rows))
     Path("place/other.csv").write_text("a,b\n1,2\n")
-    Path("place/._s.tsv").write_text("split: what a Mac leaves on other disks")
+    Path("place/._s.tsv").write_text("filename\tsplit\n")   # as a Mac leaves on other disks
     names, out, err = held_out()
     assert names == ["toy_005.png"]
     assert f"split by place/{name}" in out
@@ -1407,7 +1417,7 @@ def test_the_command_line_makes_a_toy_with_any_knob(desk):
 
 
 @pytest.mark.parametrize("argv", [
-    "toy --sizee 9", "toy --siz 9", "toy --size x", "", "nowhere", "brandenburg", "x --download",
+    "toy --sizee 9", "toy --siz 32", "toy --size x", "", "nowhere", "brandenburg", "x --download",
     "toy --occluders 2", "place --downscale 0", "place --downscale 16", "toy --pose_noise nan",
     "toy --pose_noise inf", "toy --downscale 4", "toy --split x.tsv", "place --split x.tsv",
     "toy --exposure -1", "toy --exposure 2.1", "toy --seed -1", "place --size 9", "toy --size 15",
