@@ -1338,11 +1338,12 @@ def psnr(a, b):
     return -10 * math.log10(max(error, 1e-10))
 
 
-def make_lpips(device):
-    """The network of LPIPS, a learned perceptual distance (AlexNet, v0.1), or None with a line."""
+def make_lpips():
+    """The network of LPIPS, a learned perceptual distance (AlexNet, v0.1), on the CPU like the
+    pictures that are scored; or None with a line."""
     try:
         import lpips
-        return lpips.LPIPS(net="alex", verbose=False).to(device)
+        return lpips.LPIPS(net="alex", verbose=False)
     except Exception as error:  # not installed, or its weights cannot be fetched
         print(f"  lpips is null ({error}): pip install lpips, with a network for its weights")
         return None
@@ -1571,7 +1572,7 @@ def finish(model, scene, state, run):
     if device.type == "cuda":
         peak = torch.cuda.max_memory_allocated(device)
         machine = torch.cuda.get_device_name(device)
-    scores, codes = evaluate(model, scene, make_lpips(device))
+    scores, codes = evaluate(model, scene, make_lpips())
     write_panel(run / "panel.png", model, scene, codes)
     if isinstance(model, GeoNVS):
         level = model.sdf.octree.cells[:, 0]
