@@ -3758,6 +3758,19 @@ class FreeDeviation(geonvs.Deviation):
         self.v.clamp_(max=math.log(most) / 10)
 
 
+class NoNormal(geonvs.GeoNVS):
+    """Its colour network sees zeros instead of normals."""
+    def __init__(self, cfg, scene):
+        super().__init__(cfg, scene)
+        self.color.register_forward_pre_hook(self.hide_normal)
+
+    def hide_normal(self, _, inputs):
+        x = inputs[0].clone()
+        begin = geonvs.GEO + self.sdf.features
+        x[:, begin:begin + 3] = 0
+        return x
+
+
 def dense_octree(octree, points, dense, near):
     """The foreground (half = 1) as a uniform grid: every cell is split down to the last level."""
     if octree.half == 1:
@@ -3798,6 +3811,7 @@ PIECES = {
     "no appearance": Row(dict(appearance="off")),
     "no background": Row(dict(background="off")),
     "no Lipschitz": Row(dict(lam_lps=0.0)),
+    "no normal": Row(kind=NoNormal),
     "uniform sampling": Row(replaced=dict(inverse_cdf=even_samples)),
     "no uniform share": Row(replaced=dict(UNIFORM_SHARE=0.0)),
     "no floor of zeta": Row(replaced=dict(Deviation=FreeDeviation)),
@@ -3811,6 +3825,7 @@ STRESS = {  # knobs of the toy, and the row of PIECES that is made for them
     "hard": (dict(photos=24, occluders=0.25, exposure=2.0, pose_noise=1.0), "no SfM term"),
     "crowd": (dict(photos=24, occluders=0.4), "no mask"),
     "lights": (dict(photos=24, exposure=2.0), "no appearance"),
+    "sun": (dict(photos=24, sun=60.0), "no normal"),
     "few photos": (dict(photos=8), "no SfM term"),
     "wrong poses": (dict(photos=24, pose_noise=3.0), "no curvature"),
     "other building": (dict(photos=24, landmark=3), "no curvature")}
@@ -3882,7 +3897,7 @@ def run_row(run, given, row):
         config=asdict(cfg),
         toy=row.toy,
         replaced={name: getattr(v, "__name__", v) for name, v in row.replaced.items()},
-        method=row.kind.name)
+        method=row.kind.__name__)
     path = run / "row.json"
     saved = json.loads(path.read_text()) if path.exists() else {}
     if saved.get("key") != key:
@@ -4195,7 +4210,10 @@ def quick_rows(monkeypatch, tmp_path):
     return [f"--{key}={value}" for key, value in FEW.items()]
 
 
-REPLACING = {title: row for title, row in (PIECES | GRID).items() if row.replaced}
+REPLACING = {
+    title: row
+    for title, row in (PIECES | GRID).items()
+    if row.replaced or row.kind is not geonvs.GeoNVS}
 
 
 @pytest.mark.parametrize("title", REPLACING)
