@@ -120,10 +120,10 @@ class Config:
     lam_curv: float = opt(0.01, "weight of the curvature loss, on |lap| eps [D4]")
     lam_gpl: float = opt(0.05, "weight of the geometry-preservation loss (paper) [D7]")
     lam_lps: float = opt(1e-5, "weight of the Lipschitz loss, log form [D5]")
-    lam_off: float = opt(1e-3, "weight of the off-surface loss")
     lam_sfm: float = opt(7.5e-3, "weight of min(zeta, 40) |s(p)| at SfM points [D10]")
     lam_mask: float = opt(0.04, "error above that of SfM pixels that masks a ray [D7]")
-    lr_grid: float = opt(1e-2, "learning rate of octree features and appearance codes")
+    lr_grid: float = opt(1e-2, "learning rate of octree features")
+    lr_code: float = opt(3e-2, "learning rate of appearance codes")
     lr_net: float = opt(4e-3, "learning rate of networks")
 
     def __post_init__(self):
@@ -544,26 +544,22 @@ class SDFField(nn.Module):
 
 
 class LipschitzLinear(nn.Linear):
-    """A layer whose rows are scaled to an L1 norm of at most a learned bound (Liu et al. 2022)."""
+    """A layer whose rows are scaled to an L1 norm of at most exp(c), with c learned: its Lipschitz
+    bound in the max norm (Liu et al. 2022, who have softplus for exp)."""
     def __init__(self, inputs, outputs):
         super().__init__(inputs, outputs)
         largest = self.weight.detach().abs().sum(1).max()
-        self.c = nn.Parameter(torch.log(torch.expm1(largest)))  # softplus(c) is that norm
-
-    def bound(self):
-        """Lipschitz bound in the max norm; above 0, as the loss takes its log."""
-        return F.softplus(self.c) + 1e-6
+        self.c = nn.Parameter(largest.log())
 
     def forward(self, x):
         norm = self.weight.abs().sum(1, keepdim=True)  # (out,1)
-        scale = (self.bound() / norm).clamp(max=1)
+        scale = (self.c.exp() / norm).clamp(max=1)
         return F.linear(x, self.weight * scale, self.bias)
 
 
 def lipschitz_loss(network):
-    """Sum of the logs of the layers' bounds. [D5]"""
-    bounds = [layer.bound() for layer in network[::2]]
-    return torch.stack(bounds).log().sum()
+    """Log of the network's bound, the product of its layers'. [D5]"""
+    return sum(layer.c for layer in network[::2])
 
 
 # ---- 5 From SDF to colour: alpha, compositing, samples, background -------------------------------
@@ -628,13 +624,13 @@ class SDFCache(nn.Module):
         self.volume = nn.Buffer(torch.zeros(1, 1, n, n, n))  # x slowest
 
     @torch.no_grad()
-    def refresh(self, sdf, part=0, parts=1):
-        """Evaluates sdf, (P,3) to (P,), again on every parts-th slice, from slice `part`."""
+    def refresh(self, sdf):
+        """Evaluates sdf, (P,3) to (P,), again."""
         n = self.volume.shape[-1]
         line = torch.linspace(-1, 1, n, device=self.volume.device)  # (n,)
-        x = torch.cartesian_prod(line[part::parts], line, line)  # (P,3)
+        x = torch.cartesian_prod(line, line, line)  # (P,3)
         s = in_chunks(sdf, x)  # (P,)
-        self.volume[0, 0, part::parts] = s.reshape(-1, n, n)
+        self.volume.copy_(s.reshape(self.volume.shape))
 
     def sdf(self, x):
         """s (R,N) at x (R,N,3), trilinear."""
@@ -717,7 +713,7 @@ def render_rays(model, rays, code, jitter):
     """One ray batch through the whole model. code: (R,A) appearance; jitter in 0..1, S columns for
     the foreground, of which the first is spare, then the background's. Returns rgb (R,3), opacity
     (R,); without gradient depth (R,) and end (R,3), where the ray ends; there normal (R,3), e_grad,
-    e_curv (R,); distances t (R,S+1); is_inside (R,), whether the ray meets the sphere."""
+    e_curv (R,); distances t (R,S+1)."""
     S = model.cfg.samples
     zeta = model.deviation()
     t0, t1 = sphere_interval(rays)  # (R,1)
@@ -758,8 +754,7 @@ def render_rays(model, rays, code, jitter):
         normal=normal,
         e_grad=eikonal(grad),
         e_curv=lap.abs() * model.eps * (1 - trans.detach()),  # [D4]
-        t=t,
-        is_inside=(t1 > t0)[:, 0])
+        t=t)
 
 
 # ---- 6 Photos in the wild: transient mask and geometry preservation ------------------------------
@@ -1009,14 +1004,12 @@ class GeoNVS(nn.Module):
         sample = rays.at(t)[::2]  # (N,1,3) a random one of every second ray [D13]
         N = len(sample)
         taps = sample + self.eps * self.sdf.taps  # (N,5,3)
-        cube = 2 * uniform(gen, N, 3) - 1
         sfm = self.sfm[random_index(gen, len(self.sfm), N)]
-        points = torch.cat([taps.flatten(0, 1), cube, sfm])
-        s_taps, s_cube, s_sfm = self.distance(points).split([5 * N, N, N])
+        points = torch.cat([taps.flatten(0, 1), sfm])
+        s_taps, s_sfm = self.distance(points).split([5 * N, N])
         grad, _ = finite_differences(s_taps.reshape(N, 5), self.sdf.taps, self.eps)
-        is_inside = out["is_inside"]
-        eik_end = (is_inside * out["e_grad"]).mean()
-        eik_sample = (is_inside[::2] * eikonal(grad)).mean()
+        eik_end = out["e_grad"].mean()
+        eik_sample = eikonal(grad).mean()
         pull = self.deviation().detach().clamp(max=40)  # [D10]
 
         terms = dict(
@@ -1024,7 +1017,6 @@ class GeoNVS(nn.Module):
             eik=(eik_end + eik_sample) / 2,
             curv=out["e_curv"].mean(),  # [D4]
             lps=lipschitz_loss(self.color),
-            off=torch.exp(-50 * s_cube.abs()).mean(),
             sfm=pull * s_sfm.abs().mean(),
             mask=mask.mean(),
             gpl=gpl_loss(mask, phi))
@@ -1033,17 +1025,16 @@ class GeoNVS(nn.Module):
             + cfg.lam_eik * terms["eik"]
             + cfg.lam_curv * terms["curv"]
             + cfg.lam_lps * terms["lps"]
-            + cfg.lam_off * terms["off"]
             + cfg.lam_sfm * terms["sfm"]
             + l_mask)  # lam_mask L_reg + lam_gpl L_GPL, by way of its price [D7]
         out |= dict(error=error, mask=mask, is_static=is_static, detail=detail)
         return total, terms, out
 
     def before_step(self, step, done):
-        """Keeps zeta within its bounds and an eighth of the cache up to date. done: 0..1."""
+        """Keeps zeta within its bounds and the cache up to date. done: 0..1."""
         self.deviation.bound(done, most=32 * self.cfg.samples)  # about 1 / the finest section
-        if step % 8 == 0:
-            self.cache.refresh(self.distance, step // 8 % 8, 8)
+        if step % 64 == 0:
+            self.cache.refresh(self.distance)
 
     @torch.no_grad()
     def observe(self, rays, out):
@@ -1064,16 +1055,18 @@ class GeoNVS(nn.Module):
         return random_rays(self.scene, img, gen), picked
 
     def groups(self):
-        """Optimiser groups: networks; lookup tables, which learn faster; zeta, whose larger eps
-        keeps vanishing gradients from driving it away; the mask."""
-        tables = [self.appearance.weight] + [octree.features for octree in self.octrees]
+        """Optimiser groups: networks; features and codes, which learn faster; zeta, whose larger
+        eps keeps vanishing gradients from driving it away; the mask."""
+        grids = [octree.features for octree in self.octrees]
+        codes = [self.appearance.weight]
         mask = list(self.mask.parameters())
         zeta = [self.deviation.v]
-        special = {id(p) for p in tables + mask + zeta}
+        special = {id(p) for p in grids + codes + mask + zeta}
         networks = [p for p in self.parameters() if id(p) not in special]
         return [
             dict(params=networks, lr=self.cfg.lr_net),
-            dict(params=tables, lr=self.cfg.lr_grid),
+            dict(params=grids, lr=self.cfg.lr_grid),
+            dict(params=codes, lr=self.cfg.lr_code),
             dict(params=zeta, lr=1e-3, eps=1e-8),
             dict(params=mask, lr=8e-3)]
 

@@ -1705,8 +1705,9 @@ def test_a_lipschitz_layer_starts_as_a_plain_one_and_reaches_its_bound_in_every_
     close(layer(x), F.linear(x, layer.weight, layer.bias))
     layer.c.data -= 2
     steepest = layer.weight.sign()
-    close((layer(steepest) - layer.bias).diag(), layer.bound().expand(5))
-    assert ((layer(x) - layer.bias).abs().amax(1) <= layer.bound() * x.abs().amax(1)).all()
+    bound = layer.c.exp()
+    close((layer(steepest) - layer.bias).diag(), bound.expand(5))
+    assert ((layer(x) - layer.bias).abs().amax(1) <= bound * x.abs().amax(1)).all()
 
 
 # ---- 5 from SDF to colour ------------------------------------------------------------------------
@@ -1801,7 +1802,7 @@ def plain_color(model, x):
     for layer in model.color[::2]:
         rows = []
         for row in layer.weight:
-            bound = F.softplus(layer.c) + 1e-6
+            bound = layer.c.exp()
             rows.append(row * min(1, bound / row.abs().sum()))
         out = torch.stack(rows) @ x + layer.bias
         x = out.relu()
@@ -2093,14 +2094,13 @@ def plain_losses(model, rays, photos, done, gen):
     half = R // 2
     jitter = geonvs.uniform(gen, R, cfg.samples + cfg.bg_samples)
     which = (geonvs.uniform(gen, R) * (cfg.samples + 1)).long()
-    cube = 2 * geonvs.uniform(gen, half, 3) - 1
     sfm = (geonvs.uniform(gen, half) * len(model.sfm)).long()
     out = geonvs.render_rays(model, rays, model.appearance(rays.img), jitter)
     p50, p75, p95 = model.mask.complexity.tolist()
     price = max(0.15, cfg.lam_mask + model.mask.sfm_error.item())
     n = model.mask.static.shape[1]
     terms = dict.fromkeys(
-        ("rgb", "eik", "curv", "lps", "off", "sfm", "mask", "gpl"),
+        ("rgb", "eik", "curv", "lps", "sfm", "mask", "gpl"),
         0.0)
     lesson = 0.0
     for r in range(R):
@@ -2126,23 +2126,19 @@ def plain_losses(model, rays, photos, done, gen):
             if excess > 0 and M > (done / 0.3) ** 2:
                 M = 1.0
         terms["rgb"] += (1 - M) * residual.mean() / R
-        if r > 0:  # ray 0 misses the sphere
-            terms["eik"] += e_grad / 2 / R
-        if r > 0 and r % 2 == 0:
+        terms["eik"] += e_grad / 2 / R
+        if r % 2 == 0:
             x = rays.o[r] + out["t"][r, which[r]] * rays.d[r]
             grad, _ = model.sdf.derivatives(x[None], model.eps)
             terms["eik"] += (grad.norm() - 1) ** 2 / 2 / half
         terms["curv"] += e_curv / R
         terms["mask"] += M / R
         terms["gpl"] += M * phi / R
-    for x in cube:
-        off = model.distance(x[None])[0].abs()
-        terms["off"] += torch.exp(-50 * off) / half
     for x in model.sfm[sfm]:
         on = model.distance(x[None])[0].abs()
         terms["sfm"] += min(model.deviation().item(), 40) * on / half
     for layer in model.color[::2]:
-        terms["lps"] += layer.bound().log()
+        terms["lps"] += layer.c
     return terms, lesson
 
 
@@ -2150,7 +2146,6 @@ LAMBDAS = dict(
     lam_eik=0.3,
     lam_curv=0.7,
     lam_lps=0.11,
-    lam_off=0.9,
     lam_sfm=0.5)
 
 
@@ -2231,6 +2226,7 @@ def test_no_cell_is_smaller_than_a_pixel_and_none_needlessly_large(scene, footpr
 def test_every_parameter_has_one_group_and_the_rate_of_its_kind(warm):
     warm.cfg.lr_net = 0.1
     warm.cfg.lr_grid = 0.2
+    warm.cfg.lr_code = 0.3
     rates = []
     for group in warm.groups():
         rates += [(id(p), group["lr"]) for p in group["params"]]
@@ -2241,8 +2237,10 @@ def test_every_parameter_has_one_group_and_the_rate_of_its_kind(warm):
             rate = 8e-3
         if name == "deviation.v":
             rate = 1e-3
-        if "octree" in name or "appearance" in name:
+        if "octree" in name:
             rate = 0.2
+        if "appearance" in name:
+            rate = 0.3
         wanted.append((id(p), rate))
     assert sorted(rates) == sorted(wanted)
 
@@ -2254,14 +2252,13 @@ def test_a_model_starts_as_a_small_sphere_that_the_cache_knows(warm):
     assert (warm.cache.sdf(x[None])[0] - s).abs().max() < 0.03
 
 
-def test_every_eighth_step_renews_an_eighth_of_the_cache_and_every_one_bounds_zeta(warm):
+def test_every_64th_step_renews_the_cache_and_every_one_bounds_zeta(warm):
     warm.deviation.v.data.fill_(2)
-    for step in range(20):
+    for step in range(70):
         warm.cache.volume.fill_(7)
         warm.before_step(step, 0.0)
-        renewed = (warm.cache.volume[0, 0, :, 0, 0] != 7).nonzero()[:, 0]
-        wanted = range(step // 8, 64, 8) if step % 8 == 0 else []
-        assert renewed.tolist() == list(wanted)
+        is_renewed = warm.cache.volume != 7
+        assert is_renewed.all() == is_renewed.any() == (step % 64 == 0)
         close(warm.deviation(), 32 * 8, 1e-4)
 
 
@@ -3649,7 +3646,7 @@ class Splats(Rival):
             dict(params=[self.opacity], lr=5e-2),
             dict(params=[self.feature], lr=2e-2),
             dict(params=list(self.paint.parameters()), lr=2e-3),
-            dict(params=[self.appearance.weight], lr=self.cfg.lr_grid)]
+            dict(params=[self.appearance.weight], lr=self.cfg.lr_code)]
 
     def render(self, rays, code):
         """rgb (R,3); the rays of each photo at once, under the code of the first of them. The
@@ -3792,6 +3789,7 @@ class Row(NamedTuple):
     replaced: dict = {}  # of geonvs, by name, during the run
     kind: type = geonvs.GeoNVS
     toy: dict = None  # knobs of data_prep.make_toy
+    seeds: int = 99  # at most
 
 
 PIECES = {
@@ -3819,16 +3817,16 @@ PIECES = {
 GRID = {
     "octree": Row(),
     "uniform grid": Row(replaced=dict(seed_octree=dense_octree, refined_keys=same_keys))}
-STRESS = {  # knobs of the toy, and the row of PIECES that is made for them
-    "easy": (dict(photos=48, occluders=0.04, exposure=0.5), "no mask"),
-    "middle": (dict(photos=32, occluders=0.15, exposure=1.0, pose_noise=0.5), "no GPL"),
-    "hard": (dict(photos=24, occluders=0.25, exposure=2.0, pose_noise=1.0), "no SfM term"),
-    "crowd": (dict(photos=24, occluders=0.4), "no mask"),
-    "lights": (dict(photos=24, exposure=2.0), "no appearance"),
-    "sun": (dict(photos=24, sun=60.0), "no normal"),
-    "few photos": (dict(photos=8), "no SfM term"),
-    "wrong poses": (dict(photos=24, pose_noise=3.0), "no curvature"),
-    "other building": (dict(photos=24, landmark=3), "no curvature")}
+STRESS = {  # knobs of the toy, the row of PIECES that is made for them, seeds
+    "easy": (dict(photos=48, occluders=0.04, exposure=0.5), "no mask", 1),
+    "middle": (dict(photos=32, occluders=0.15, exposure=1.0, pose_noise=0.5), "no GPL", 1),
+    "hard": (dict(photos=24, occluders=0.25, exposure=2.0, pose_noise=1.0), "no SfM term", 3),
+    "crowd": (dict(photos=24, occluders=0.4), "no mask", 3),
+    "lights": (dict(photos=24, exposure=2.0), "no appearance", 1),
+    "sun": (dict(photos=24, sun=60.0), "no normal", 1),
+    "few photos": (dict(photos=8), "no SfM term", 3),
+    "wrong poses": (dict(photos=24, pose_noise=3.0), "no curvature", 3),
+    "other building": (dict(photos=24, landmark=3), "no curvature", 1)}
 PUBLISHED = {
     geonvs.GeoNVS: {},
     NeRFW: dict(
@@ -3868,13 +3866,14 @@ def stress_rows(given, sizes):
     """In every cell: the method, without the piece that is made for the cell, and its rivals."""
     budget = {} if {"steps", "minutes"} & set(given) else dict(minutes=1.5)
     rows = {}
-    for cell, (toy, piece) in STRESS.items():
+    for cell, (toy, piece, seeds) in STRESS.items():
         for how in ("full", piece):
             row = PIECES[how]
             settings = sizes[geonvs.GeoNVS] | budget | row.settings
-            rows[f"{cell}: {how}"] = row._replace(settings=settings, toy=toy)
+            rows[f"{cell}: {how}"] = row._replace(settings=settings, toy=toy, seeds=seeds)
         for kind in RIVALS:
-            rows[f"{cell}: {kind.name}"] = Row(sizes[kind] | budget, kind=kind, toy=toy)
+            settings = sizes[kind] | budget
+            rows[f"{cell}: {kind.name}"] = Row(settings, kind=kind, toy=toy, seeds=seeds)
     return rows
 
 
@@ -4053,7 +4052,7 @@ def experiment(argv):
     for title, row in rows.items():
         folder = title.replace(" ", "_").replace(":", "")
         runs = []
-        for seed in range(seeds):
+        for seed in range(min(seeds, row.seeds)):
             runs.append(run_row(where / f"{folder}-{seed}", given | dict(seed=seed), row))
         table.append(summary(title, runs))
     has_base = table[0]["psnr"] is not None
