@@ -41,7 +41,8 @@ Where the printed paper is departed from, the line carries its tag:
   [D9]  only the colour and background networks have mixed precision: distances stay float32 (the
         mask's convolutions may use TF32)
   [D10] SfM points place the sphere, seed the octree, teach M = 0 and pull s(p) to zero, but less
-        while zeta is below 40: a strong pull would leave the surface fog
+        while zeta is below 40: a strong pull would leave the surface fog. There is no off-surface
+        penalty, which bought nothing, and no warm-up: s starts as a small sphere
   [D11] samples are drawn from a cached SDF volume; no second network pass along the ray
   [D12] a test photo's code is fitted on its left half, its score is taken on the right half
   [D13] derivatives are differences between four taps, around the ray's end and, on every second
