@@ -18,16 +18,17 @@ Conventions
   mask      M = 1 means transient (person, car), M = 0 means scene
   symbols   s signed distance, zeta sharpness of walls (1 / zeta is their width), eps length of the
             taps of finite differences, lap the Laplacian, E_grad = (|grad s| - 1)^2, Phi edges
-  shapes    R rays, S sections of a ray (S + 1 samples), P points, N cells, L octree levels, C
-            channels per level, V rows of features, H hidden width, G what colour is read from,
-            A appearance dims, B photos of all I, K SfM points, T sightings of them
+  shapes    R rays, S sections of a ray (S + 1 samples), P points, N cells or what a line says, L
+            octree levels, C channels per level, V rows of features, H hidden width, G what colour
+            is read from, A appearance dims, B photos of all I, K SfM points, T sightings of them
 
 Where the printed paper is departed from, the line carries its tag:
   [D1]  alpha is divided by sigmoid(zeta s_i) and never negative (printed: a wall is 63 % opaque)
   [D2]  alpha has no beta: s is evaluated at both ends of a section, so no slope has to be guessed;
         a section has the mean colour of its ends
-  [D3]  Phi is a sigmoid of 10 E_grad + 2 |lap| eps opacity at the ray's end, set by quantiles of
-        rays that end on the foreground, times opacity; it has no gradient
+  [D3]  Phi = opacity sigmoid((10 E_grad + 2 E_curv - centre) / width) at the ray's end, with
+        E_curv = |lap| eps opacity; centre and width follow quantiles over rays that end on the
+        foreground; no gradient
   [D4]  the curvature loss is |lap| eps opacity, since |lap| of a trilinear field grows as eps
         shrinks; its weight is 0.01 (printed: lambda_curv = 2 stands in Eq. 4 and in Eq. 5)
   [D5]  the Lipschitz term is a sum of logs, not a product that can drown the colour at first
@@ -35,8 +36,8 @@ Where the printed paper is departed from, the line carries its tag:
   [D7]  M is learnt by classification. A ray is transient if its error (of the worst channel)
         exceeds its price, which is
         max(upper quartile of errors at SfM pixels + lam_mask, 0.15) + lam_gpl Phi. There is no
-        term for bimodality. Lessons end after 60 % of training; in the first 30 % such rays
-        teach no colours as soon as M suspects them
+        term for bimodality. M is taught in the first 60 % of training; in the first 30 % a ray
+        above its price that M suspects teaches no colours
   [D8]  the background also fills what lies before the sphere; its last section is opaque
   [D9]  only the colour and background networks have mixed precision: distances stay float32 (the
         mask's convolutions may use TF32)
@@ -157,7 +158,7 @@ LARGE = dict(
 class Scene(NamedTuple):
     """The arrays of a scene file (data_prep.py documents them) as tensors on the device."""
     rgb: Tensor  # (N,3) uint8, all pixels of all photos
-    start: Tensor  # (I+1,) first pixel of each photo
+    start: Tensor  # (I+1,) first pixel of each photo, and the end
     wh: Tensor  # (I,2) width, height in px
     K: Tensor  # (I,4) fx fy cx cy in px
     c2w: Tensor  # (I,3,4)
@@ -256,7 +257,8 @@ def sphere_interval(rays):
 # ---- 3 Octree: features on the corners of cells --------------------------------------------------
 
 CHUNK = 2**15  # points evaluated at once without gradient
-MAX_CELLS = 8_000_000  # of the foreground: about 1 GB with Adam's moments
+ROOT = 16  # cells of the coarsest level along an axis
+MAX_CELLS = 8_000_000  # of the foreground: about 1 GB with Adam's moments, more while refining
 
 
 def corner_weights(f):
@@ -303,7 +305,7 @@ class Octree(nn.Module):
     there. A corner that lacks one of its cells ("hanging") has the weight 0, so the field is
     continuous across borders of refined regions. At a place where a level has no cell, the
     features of that level are 0."""
-    def __init__(self, half, levels, channels=4, root=16):
+    def __init__(self, half, levels, channels=4, root=ROOT):
         super().__init__()
         self.half = half
         self.levels = levels
@@ -352,7 +354,7 @@ class Octree(nn.Module):
         is_split = torch.cat(splits)
         first = self.root**3 + 8 * (is_split.cumsum(0) - 1)  # (N,) children follow each other
         self.child = torch.where(is_split, first, 0).int()  # (N,) 0: none
-        self.ends = nn.Buffer(torch.zeros(len(first), 3, device=first.device))  # (N,3) by record
+        self.ends = nn.Buffer(torch.zeros(len(first), 3, device=first.device))  # (N,3) see record
 
         corners = self.cells[:, None] + F.pad(octants, (1, 0))  # (N,8,4)
         key = self.key(corners)  # (N,8)
@@ -370,9 +372,9 @@ class Octree(nn.Module):
         return old_row
 
     def locate(self, x):
-        """For x (P,3) and each level: the finest cell so far, a row of cells (P,L); whether the
-        level has a cell there (P,L); the place in it, 0..1 (P,L,3). An x outside the cube is
-        moved to its border."""
+        """For x (P,3) and each level: the row in cells of the finest cell around x down to that
+        level (P,L); whether the level has a cell there (P,L); the place in it, 0..1 (P,L,3). An x
+        outside the cube is moved to its border."""
         at = 0.5 + x * (0.5 / self.half)  # (P,3) over the cube
         at = at.clamp(0, 1 - 1e-6).nan_to_num(0)
         at = at[:, None] * self.resolution[:, None]  # (P,L,3) in cells
@@ -446,7 +448,7 @@ HIDDEN = 6.0  # zeta |s| from where on the field is hardly seen: sigmoid(-6) = 0
 def refined_keys(octree, sdf, zeta):
     """Keys of the cells that should be split. sdf: (P,3) to (P,). Of the cells at the surface whose
     children are no finer than a pixel, the worst are split: those that hold most of the error
-    recorded there. A cell is merged if nothing near it is seen. [D15]"""
+    recorded there. A cell is merged if |s| says that no visible wall is near. [D15]"""
     level = octree.cells[:, 0]  # (N,)
     side = octree.side(level)
     index = octree.cells[:, 1:]  # (N,3)
@@ -455,9 +457,9 @@ def refined_keys(octree, sdf, zeta):
     reach = 1.87 * side  # half a cell's diagonal, and a cell
     is_split = octree.child > 0
     error, pixel, count = octree.ends.unbind(1)  # (N,) sums
-    is_open = (s < reach) & ~is_split & (level < octree.levels - 1)
+    can_split = (s < reach) & ~is_split & (level < octree.levels - 1)
     is_coarse = pixel < count * side / 2  # mean size of a pixel under a child's side
-    error = error * (is_open & is_coarse)
+    error = error * (can_split & is_coarse)
     worst = error.argsort(descending=True)  # (N,)
     before = error[worst].cumsum(0) - error[worst]  # (N,) what worse cells hold
     wanted = int((before < ERROR_SHARE * error.sum()).sum())
@@ -469,13 +471,13 @@ def refined_keys(octree, sdf, zeta):
 
 # ---- 4 Fields: the networks on top of the octree -------------------------------------------------
 
-SPHERE = 0.25  # radius of the sphere that training starts from
+SPHERE = 0.25  # radius of the sphere that training starts from [D10]
 GEO = 15  # length of the geometry feature that the SDF network hands to the colour network
 MIXED_ON = {"cuda"}  # devices whose colour and background networks run in bfloat16 [D9]
 
 
 def mixed_precision(network, x):
-    """network(x) in float32, computed in bfloat16 where that pays. [D9]"""
+    """network(x), computed in bfloat16 where that pays, returned as float32. [D9]"""
     if x.device.type not in MIXED_ON:
         return network(x)
     with torch.autocast(x.device.type, torch.bfloat16):
@@ -712,9 +714,9 @@ def direction_code(d):
 
 def render_rays(model, rays, code, jitter):
     """One ray batch through the whole model. code: (R,A) appearance; jitter in 0..1, S columns for
-    the foreground, of which the first is spare, then the background's. Returns rgb (R,3), opacity
-    (R,); without gradient depth (R,) and end (R,3), where the ray ends; there normal (R,3), e_grad,
-    e_curv (R,); distances t (R,S+1)."""
+    the foreground, of which the first is not used, then the background's. Returns a dictionary: rgb
+    (R,3); opacity (R,); depth (R,) and end (R,3), where the ray ends on average, both without
+    gradient; normal (R,3), e_grad and e_curv (R,) at that end; t (R,S+1) of the samples."""
     S = model.cfg.samples
     zeta = model.deviation()
     t0, t1 = sphere_interval(rays)  # (R,1)
@@ -727,7 +729,7 @@ def render_rays(model, rays, code, jitter):
     w, trans = composite(alpha)  # (R,S), (R,)
     at_near_end = F.pad(w, (0, 1))  # (R,S+1)
     at_far_end = F.pad(w, (1, 0))
-    w = (at_far_end + at_near_end) / 2  # (R,S+1) of samples: half of their two sections'
+    w = (at_far_end + at_near_end) / 2  # (R,S+1) of samples: half of their two sections' [D2]
 
     depth = (w * t).sum(1) + trans * t1[:, 0]
     depth = depth.detach()  # (R,)
@@ -847,6 +849,11 @@ def transient_loss(logit, error, price):
     return F.binary_cross_entropy_with_logits(logit, is_transient, weight)
 
 
+REJECTING = 0.3  # share of training in which outliers are rejected [D7]
+LEAST_PRICE = 0.15  # error of a ray below which it is never transient
+TAUGHT = 0.6  # share of training in which the mask learns; later it would give up people
+
+
 def reject_outliers(mask, is_outlier, done):
     """M (R,), but 1 for outliers, rays whose error exceeds their price, that the network suspects
     too. It has to suspect them more from step to step, and after 30 % of training M alone counts:
@@ -862,11 +869,6 @@ def follow_quantiles(running, shares, values, is_chosen, rate=0.1):
     count = is_chosen.sum()
     excess = (count * shares - is_below.sum(0)) / count.clamp(min=1)  # (Q,) 0 if none is chosen
     running *= torch.exp(rate * excess)
-
-
-REJECTING = 0.3  # share of training in which outliers are rejected
-LEAST_PRICE = 0.15  # error of a ray below which it is never transient
-TAUGHT = 0.6  # share of training in which the mask learns; later it would give up people
 
 
 class TransientMask(nn.Module):
@@ -912,7 +914,7 @@ class TransientMask(nn.Module):
 # ---- 7 The model and its objective ---------------------------------------------------------------
 
 def is_on(setting, default):
-    """Of a part of the model, "auto", "on" or "off". [D15]"""
+    """Whether a part of the model is used; setting: on, off, or auto, which means default. [D15]"""
     return default if setting == "auto" else setting == "on"
 
 
@@ -928,9 +930,9 @@ class GeoNVS(nn.Module):
         self.scene = scene
         raw = scene.raw
         levels = cfg.levels
-        if levels == 0:  # no cell smaller than a pixel
+        if levels == 0:  # no cell smaller than a pixel [D15]
             pixels = 2 / raw["footprint"]  # from side to side
-            levels = 1 + math.floor(math.log2(pixels / 16))
+            levels = 1 + math.floor(math.log2(pixels / ROOT))
             levels = min(max(levels, 2), 8)
         A = 0
         if is_on(cfg.appearance, raw["exposure_spread"] > 0.01):
@@ -952,14 +954,14 @@ class GeoNVS(nn.Module):
         self.octrees = [octree]
         self.background = None
         self.bg_color = constant(*np.nan_to_num(raw["bg_color"], nan=0.5).tolist())
-        has_colors = bool(np.isnan(raw["bg_color"]).any())
+        has_colors = bool(np.isnan(raw["bg_color"]).any())  # nan: it has no one colour
         if is_on(cfg.background, has_colors):
             points = scene.points[~is_inside]
             self.background = Background(points, cfg.hidden, 9 + A, min(levels, 4))
             self.octrees.append(self.background.octree)
         self.deviation = Deviation()
         self.mask = TransientMask(scene)
-        finest = 16 * 2 ** (levels - 1)  # cells along an axis
+        finest = ROOT * 2 ** (levels - 1)  # cells along an axis
         self.cache = SDFCache(min(max(finest, 64), 128))
         self.cache.refresh(self.distance)
         print(f"  {levels} levels, appearance code of {A}, {len(self.octrees)} octrees")
@@ -1026,14 +1028,14 @@ class GeoNVS(nn.Module):
             + cfg.lam_eik * terms["eik"]
             + cfg.lam_curv * terms["curv"]
             + cfg.lam_lps * terms["lps"]
-            + cfg.lam_sfm * terms["sfm"]
+            + cfg.lam_sfm * terms["sfm"]  # [D10]
             + l_mask)  # lam_mask L_reg + lam_gpl L_GPL, by way of its price [D7]
         out |= dict(error=error, mask=mask, is_static=is_static, detail=detail)
         return total, terms, out
 
     def before_step(self, step, done):
         """Keeps zeta within its bounds and the cache up to date. done: 0..1."""
-        self.deviation.bound(done, most=32 * self.cfg.samples)  # about 1 / the finest section
+        self.deviation.bound(done, most=32 * self.cfg.samples)  # 1/16 of an even section
         if step % 64 == 0:
             self.cache.refresh(self.distance)
 
@@ -1139,6 +1141,8 @@ class EnergyMeter:
 
     def tick(self):
         """Adds what was spent since the last tick. A failing counter ends metering, not the run."""
+        if self.joules is None:
+            return
         try:
             if self.counter is None:
                 self.counter = open_counter(self.device)
@@ -1147,8 +1151,7 @@ class EnergyMeter:
             self.joules += max(0.0, now - self.last)
             self.last = now
         except Exception as error:  # a package, a driver's answer or a permission is missing
-            if self.joules is not None:
-                print(f"  energy is null ({error}); a GPU's needs: pip install nvidia-ml-py")
+            print(f"  energy is null ({error}); a GPU's needs: pip install nvidia-ml-py")
             self.joules = None
 
 
@@ -1158,8 +1161,8 @@ REFINE_AT = (0.1, 0.2, 0.3, 0.45, 0.6)  # shares of training at which the octree
 PAUSE = 30  # seconds between lines of the log; a checkpoint is made with each
 START = dict(step=0, refined=0, seconds=0.0, joules=0.0)  # what a run has done so far
 RESULTS = ("checkpoint.pt", "log.jsonl", "metrics.json", "panel.png", "mesh.ply", "film.mp4")
-# torchrun starts RANKS processes. Each draws its own rays, the gradients are averaged, the first
-# process decides, speaks and writes; so all hold the same weights.
+# torchrun starts RANKS processes. Each draws its own rays and follows its own prices, the gradients
+# are averaged, the first process decides, speaks and writes; so all hold the same weights.
 RANK = int(os.environ.get("RANK", 0))
 LOCAL_RANK = int(os.environ.get("LOCAL_RANK", 0))
 RANKS = int(os.environ.get("WORLD_SIZE", 1))
@@ -1252,7 +1255,7 @@ def restore(saved, path, model, gen):
 
 def train(cfg, scene, run, saved=None, kind=GeoNVS):
     """Trains until cfg.steps or cfg.minutes; writes log.jsonl and checkpoint.pt below run. saved: a
-    checkpoint to go on from; kind: class of the model. Returns model and state."""
+    checkpoint to go on from; kind: GeoNVS, or a rival with its methods. Returns model and state."""
     torch.set_flush_denormal(True)  # vanishing weights would otherwise slow a CPU down
     torch.manual_seed(cfg.seed)
     gen = torch.Generator(scene.c2w.device).manual_seed(cfg.seed)
@@ -1283,6 +1286,9 @@ def train(cfg, scene, run, saved=None, kind=GeoNVS):
         done = state["step"] / cfg.steps
         if cfg.minutes > 0:
             done = state["seconds"] / (60 * cfg.minutes)
+        if done >= 1:
+            state["seconds"] = from_first_process(time.perf_counter() - begin)
+            model.decide_mask()  # in a run of a step or two it has not been
         is_due = done >= 1 or state["seconds"] >= next_log
         if RANK == 0 and terms and is_due:
             next_log = state["seconds"] + PAUSE
@@ -1304,7 +1310,7 @@ def train(cfg, scene, run, saved=None, kind=GeoNVS):
 
 @torch.no_grad()
 def report(model, path, done, state, terms):
-    """A line on the terminal and one in log.jsonl. psnr: of 1,024 fixed rays."""
+    """A line on the terminal and one in log.jsonl. psnr: of about 1,024 fixed rays."""
     is_sound = all(p.isfinite().all() for p in model.parameters())
     check(is_sound, "the loss is no longer finite: mend poses, or try a third of the learning "
           f"rates --lr_grid and --lr_net; checkpoint.pt beside {path} is from before")
@@ -1543,15 +1549,16 @@ def write_panel(path, model, scene, codes, width=240):
     for photo in photos.tolist():
         frame = render_photo(model, scene, photo, codes[photo])
         tiles = [frame["truth"], frame["rgb"], frame["normal"] / 2 + 0.5]
+        kind = "held out" if scene.is_test[photo] else "training"
+        text = f"{kind}: {scene.raw['name'][photo]}, render, normals"
         if model.cfg.mask != "off":
             M = model.mask.logits([photo])[0, 0].detach().sigmoid().cpu()  # (m,m)
             tiles.append(np.dstack([M, M, M]))
+            text += ", mask (white: transient)"
         h, w = frame["rgb"].shape[:2]
         size = (width, width * h // w)
         row = [cv2.resize(to_uint8(tile), size, interpolation=cv2.INTER_AREA) for tile in tiles]
         row = np.pad(np.hstack(row), ((20, 0), (0, 0), (0, 0)), constant_values=255)
-        kind = "held out" if scene.is_test[photo] else "training"
-        text = f"{kind}: {scene.raw['name'][photo]}, render, normals, mask (white: transient)"
         cv2.putText(row, text, (2, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.4, (0, 0, 0))
         rows.append(row)
     picture = np.vstack(rows)[:, :, ::-1]
@@ -1603,7 +1610,10 @@ def finish(model, scene, state, run):
 
 def in_between(keys, n):
     """n rows (n,D) evenly along the polyline through keys (B,D)."""
-    return F.interpolate(keys.T[None], n, mode="linear", align_corners=True)[0].T
+    at = torch.linspace(0, len(keys) - 1, n, device=keys.device)
+    left = at.floor()
+    right = at.ceil()
+    return torch.lerp(keys[left.long()], keys[right.long()], (at - left)[:, None])
 
 
 def film(model, scene, path):
@@ -1708,6 +1718,9 @@ def main(argv=None):
     device = pick_device(cfg.device)
     if RANKS > 1:
         start_processes(device)
+        if RANK == 0:
+            data_prep.open_scene(cfg.source, cfg.downscale)  # the others find it made
+        dist.barrier()
     raw = data_prep.open_scene(cfg.source, cfg.downscale)  # made on first use
     scene = load_scene(raw, device)
     if render:

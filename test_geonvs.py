@@ -2599,6 +2599,7 @@ def test_refining_and_deciding_on_the_mask_come_at_their_shares_of_training(
     wanted.insert(13, "decide_mask")
     for step in (12, 9, 6, 4, 2):  # shares 0.6, 0.45, 0.3, 0.2, 0.1
         wanted.insert(step + 1, "refine")
+    wanted.append("decide_mask")  # again, for runs of a step or two
     assert events == wanted
 
 
@@ -3051,6 +3052,15 @@ def test_a_panel_shows_photo_render_normals_and_mask_from_left_to_right(
         columns = place[:, 1]
         is_in_tile = columns // 120 == i
         assert is_in_tile.sum() == pixels
+
+
+def test_keys_are_met_and_joined_by_straight_lines_also_if_they_are_empty():
+    keys = random(5, 3)
+    between = geonvs.in_between(keys, 17)
+    close(between[::4], keys, 1e-5)
+    close(between[2::4], (keys[1:] + keys[:-1]) / 2, 1e-5)
+    assert geonvs.in_between(keys[:, :0], 7).shape == (7, 0)  # a model without codes
+    close(geonvs.in_between(keys[:1], 2), keys[[0, 0]], 1e-5)
 
 
 def test_a_film_sways_sideways_through_the_lights_of_training_photos(
