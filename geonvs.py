@@ -43,7 +43,7 @@ Where the printed paper is departed from, the line carries its tag:
         mask's convolutions may use TF32)
   [D10] SfM points place the sphere, seed the octree, teach M = 0 and pull s(p) to zero, but less
         while zeta is below 40: a strong pull would leave the surface fog. There is no off-surface
-        penalty, which bought nothing, and no warm-up: s starts as a small sphere
+        penalty, as trials were as good without, and no warm-up: s starts as a small sphere
   [D11] samples are drawn from a cached SDF volume; no second network pass along the ray
   [D12] a test photo's code is fitted on its left half, its score is taken on the right half
   [D13] derivatives are differences between four taps, around the ray's end and, on every second
@@ -518,8 +518,7 @@ def eikonal(grad):
 class SDFField(nn.Module):
     """s(x) and what colour is read from: a geometry feature beside the octree's own features. One
     hidden layer over xyz and features; G = GEO + L C. In float32 [D9]. The network learns what is
-    to be added to the distance from a small sphere: a surface that starts inside the landmark
-    grows to it, one that starts outside also has to be carved out of the sky."""
+    to be added to the distance from a small sphere, which grows to the landmark [D10]."""
     def __init__(self, octree, hidden):
         super().__init__()
         self.octree = octree
@@ -1035,7 +1034,7 @@ class GeoNVS(nn.Module):
 
     def before_step(self, step, done):
         """Keeps zeta within its bounds and the cache up to date. done: 0..1."""
-        self.deviation.bound(done, most=32 * self.cfg.samples)  # 1/16 of an even section
+        self.deviation.bound(done, most=32 * self.cfg.samples)  # 1/64 of an even section
         if step % 64 == 0:
             self.cache.refresh(self.distance)
 

@@ -2778,6 +2778,38 @@ def train_as_one_of_two():
     torch.save((weights, directions, layer.weight.grad), f"{geonvs.RANK}.pt")
 
 
+def test_several_processes_count_the_seconds_up_to_the_last_step(
+        scene, tmp_path, loop, monkeypatch):
+    pass_time(monkeypatch, seconds=2)
+    monkeypatch.setattr(geonvs, "RANKS", 2)
+    monkeypatch.setattr(geonvs, "from_first_process", lambda value: value)
+    monkeypatch.setattr(geonvs.dist, "broadcast", lambda *_: None)
+    _, state = run_training(scene, tmp_path, steps=5)
+    assert state["seconds"] == 10
+
+
+@pytest.mark.parametrize("rank, wanted", [
+    (0, ["open", "wait", "open"]),
+    (1, ["wait", "open"])])
+def test_the_first_process_makes_the_scene_before_the_others_open_it(monkeypatch, rank, wanted):
+    events = []
+
+    def open_scene(*_):
+        events.append("open")
+
+    def stop(*_):
+        raise KeyboardInterrupt
+    monkeypatch.setattr(geonvs, "RANKS", 2)
+    monkeypatch.setattr(geonvs, "RANK", rank)
+    monkeypatch.setattr(geonvs, "start_processes", lambda device: None)
+    monkeypatch.setattr(geonvs.dist, "barrier", lambda: events.append("wait"))
+    monkeypatch.setattr(data_prep, "open_scene", open_scene)
+    monkeypatch.setattr(geonvs, "load_scene", stop)
+    with pytest.raises(KeyboardInterrupt):
+        geonvs.main(["--device", "cpu"])
+    assert events == wanted
+
+
 def test_two_processes_train_one_model_on_the_rays_of_both(tmp_path):
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
@@ -3052,6 +3084,18 @@ def test_a_panel_shows_photo_render_normals_and_mask_from_left_to_right(
         columns = place[:, 1]
         is_in_tile = columns // 120 == i
         assert is_in_tile.sum() == pixels
+
+
+@pytest.mark.parametrize("setting, is_named", [("on", True), ("off", False)])
+def test_a_panel_names_the_mask_if_it_shows_one(
+        warm, scene, tmp_path, monkeypatch, setting, is_named):
+    warm.cfg.mask = setting
+    titles = []
+    monkeypatch.setattr(cv2, "putText", lambda row, text, *_: titles.append(text))
+    geonvs.write_panel(tmp_path / "a.png", warm, scene, warm.codes())
+    assert len(titles) == 4
+    for title in titles:
+        assert ("mask" in title) == is_named
 
 
 def test_keys_are_met_and_joined_by_straight_lines_also_if_they_are_empty():
