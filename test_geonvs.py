@@ -3102,7 +3102,7 @@ def test_keys_are_met_and_joined_by_straight_lines_also_if_they_are_empty():
     keys = random(5, 3)
     between = geonvs.in_between(keys, 17)
     close(between[::4], keys, 1e-5)
-    close(between[2::4], (keys[1:] + keys[:-1]) / 2, 1e-5)
+    close(between[1::4], (3 * keys[:-1] + keys[1:]) / 4, 1e-5)
     assert geonvs.in_between(keys[:, :0], 7).shape == (7, 0)  # a model without codes
     close(geonvs.in_between(keys[:1], 2), keys[[0, 0]], 1e-5)
 
