@@ -3897,7 +3897,7 @@ PUBLISHED = {
         rays=1024, photos=1, samples=64, hidden=256, lr_net=5e-4),
     Splats: SPLATS}
 SMALL = {  # what serves the toy best
-    geonvs.GeoNVS: dict(rays=256, lr_net=1e-2, lr_grid=2e-2),
+    geonvs.GeoNVS: dict(rays=384, hidden=32, lr_net=1e-2, lr_grid=3e-2),
     NeRFW: dict(rays=256, photos=256, samples=24, hidden=64, lr_net=5e-3),
     HaNeRF: dict(rays=256, photos=1, samples=16, hidden=64, lr_net=4e-3),
     Splats: SPLATS}
