@@ -175,7 +175,7 @@ def table(text):
 
 
 # Colour, width and height of a cell, contrast of cells, has windows; a row a surface.
-LOOKS = table("""
+MATERIALS = table("""
      .5  .46   .4  .29  .13   .2  0
      .8  .74   .6  .29  .13  .08  0
     .78  .56   .3   .3   .3  .15  1
@@ -189,7 +189,7 @@ LOOKS = table("""
     .48  .42  .34  .42  .42   .2  0
     .17  .22  .08   .6   .6   .1  0
 """)
-# Shape; centre x y z, half height, radius at the bottom and at the top, depth; look.
+# Shape; centre x y z, half height, radius at the bottom and at the top, depth; material.
 # Shape 1 is a box or roof, |x| <= radius and |y| <= depth; 2 a column or cone; 3 a ball; 0 the
 # ground, z < 0. Plinth, columns, hall; dome; tower; annex; statue.
 LANDMARK = table("""
@@ -268,8 +268,11 @@ def toy_parts(landmark, background):
             is_box = group[:, :1] == 1   # others stay round
             group[:, 4:8] *= where(is_box, size[[2, 0, 0, 1]], size[2])
         parts[:, 1] *= rng.choice((-1, 1))
-        looks = [*rng.permutation(2), *SAND + rng.permutation(2), *ROOF + rng.permutation(3), GOLD]
-        parts[:, 8] = np.take(looks, parts[:, 8].astype(int))
+        stones = rng.permutation(2)
+        walls = SAND + rng.permutation(2)
+        roofs = ROOF + rng.permutation(3)
+        materials = [*stones, *walls, *roofs, GOLD]
+        parts[:, 8] = np.take(materials, parts[:, 8].astype(int))
     if background:
         parts = concatenate([parts, TOWN])
     return parts
@@ -364,8 +367,8 @@ def paint(x, part):
     shape, centre_x, centre_y = part.T[:3]
     is_ground = shape == 0
     is_meadow = is_ground & (hypot(x, y) >= 2.6)
-    look = LOOKS[where(is_meadow, MEADOW, part[:, 8]).astype(int)]
-    width, height, contrast, windows = look.T[3:]
+    material = MATERIALS[where(is_meadow, MEADOW, part[:, 8]).astype(int)]
+    width, height, contrast, windows = material.T[3:]
     turn = np.arctan2(y - centre_y, x - centre_x)
     across = where(is_ground, x, where(shape == 1, x + y, turn))
     row = where(is_ground, y, z) / height
@@ -374,7 +377,7 @@ def paint(x, part):
     chance = abs(sin(12.9898 * floor(column) + 78.233 * floor(row))) * 437.585 % 1
     is_window = (abs(column % 1 - .5) < .2) * (abs(row % 1 - .45) < .28)
     brightness = (1 + contrast * (2 * chance - 1)) * (1 - .8 * windows * is_window)
-    return look[:, :3] * brightness[:, None]
+    return material[:, :3] * brightness[:, None]
 
 
 def shade(o, d, parts, background, sun):
@@ -642,7 +645,7 @@ def statistics(scene):
     K, c2w, wh, rgb = scene["K"], scene["c2w"], scene["wh"], scene["rgb"]
     step = max(1, len(rgb) // 500_000)
     near, places = [], []   # of all photos
-    seen, size, bright, beyond = [], [], [], []   # of the training photos
+    observed, size, bright, beyond = [], [], [], []   # of the training photos
     for i, first in enumerate(scene["start"][:-1]):
         own = scene["track_point"][scene["track_photo"] == i]
         x = scene["points"][own]
@@ -652,7 +655,7 @@ def statistics(scene):
         if scene["is_test"][i]:
             continue
         u, v = clip(uv, 0, wh[i] - 1).astype(int).T
-        seen.append(own)
+        observed.append(own)
         size.append(distance[norm(x, axis=1) < 1] / K[i, 0])
         bright.append(rgb[first + v * wh[i, 0] + u].mean(1) / 255)
         o = c2w[i, :, 3]
@@ -660,9 +663,9 @@ def statistics(scene):
         closest = o - minimum(d @ o, 0)[:, None] * d   # to the centre, along each ray
         misses = flatnonzero(norm(closest, axis=1) > 1)
         beyond.append(rgb[first + misses[::step]])
-    every = concatenate(seen)
+    every = concatenate(observed)
     mean = bincount(every, concatenate(bright)) / maximum(bincount(every), 1)   # (K,)
-    offsets = [median(b - mean[own]) for b, own in zip(bright, seen) if len(own)]
+    offsets = [median(b - mean[own]) for b, own in zip(bright, observed) if len(own)]
     beyond = concatenate(beyond)
     color = np.full(3, np.nan)
     if len(beyond) > 100:   # fewer may all be people
@@ -713,8 +716,8 @@ def read_photos(sparse):
         numbers = array(read(f"{PARAMETERS[model]}d"))
         if model in FOCAL_LENGTHS:
             n = FOCAL_LENGTHS[model]
-            bend = np.append(numbers[n + 2:], np.zeros(8))[:8]
-            cameras[key] = wh, numbers[[0, n - 1, n, n + 1]], bend
+            distortion = np.append(numbers[n + 2:], np.zeros(8))[:8]
+            cameras[key] = wh, numbers[[0, n - 1, n, n + 1]], distortion
     read = open_binary(sparse / "images.bin")
     for _ in range(*read("Q")):
         _, *pose, camera = read("I7dI")
@@ -731,8 +734,8 @@ def read_photos(sparse):
 def check_photo(camera, pose, is_test):
     """UserError, a sentence about the photo, unless it can be used."""
     check(camera, "has no camera in the model, or a fisheye: run colmap image_undistorter")
-    wh, K, bend = camera
-    numbers = array([*K, *bend, *pose])
+    wh, K, distortion = camera
+    numbers = array([*K, *distortion, *pose])
     is_sound = (abs(numbers) < FAR).all() and min(K[:2]) > 1 / FAR and pose[:4].any()
     check(is_sound and max(wh) < 32767, "has no sound camera or pose: run SfM again")
     angle = 2 * np.degrees(np.arctan(max(wh / K[:2]) / 2))
@@ -896,19 +899,19 @@ def decode(path):
 
 def read_photo(path, camera, downscale):
     """Undistorted, then reduced. -> rgb uint8 (h,w,3), K (4,)"""
-    (w, h), K, bend = camera
+    (w, h), K, distortion = camera
     check(1 <= downscale <= min(w, h) / 2, f"is {w} x {h}: choose another --downscale")
     image = decode(path)
     size = image.shape[1::-1]
     check(size == (w, h),
           f"has {size[0]} x {size[1]} pixels, its camera {w} x {h}: put back what SfM saw")
-    if bend.any():
+    if distortion.any():
         places = [0, 1, 0, 1], [0, 1, 2, 2]   # of fx fy cx cy in a matrix
         corner = 0, 0, 0.5, 0.5   # OpenCV's first pixel is at 0
         M = eye(3)
         M[places] = K - corner
-        P, _ = cv2.getOptimalNewCameraMatrix(M, bend, (w, h), 0)   # shows nothing but photo
-        image = cv2.undistort(image, M, bend, None, P)
+        P, _ = cv2.getOptimalNewCameraMatrix(M, distortion, (w, h), 0)   # shows nothing but photo
+        image = cv2.undistort(image, M, distortion, None, P)
         K = P[places] + corner
     small = w // downscale, h // downscale
     image = cv2.resize(image, small, interpolation=cv2.INTER_AREA)

@@ -178,8 +178,8 @@ class Scene(NamedTuple):
 
 def load_scene(raw, device="cpu"):
     """Scene from the dictionary of a scene file (data_prep.open_scene, make_toy or prepare)."""
-    usual = np.median(raw["wh"].max(1))  # px
-    side = int(np.clip(usual / 2, 64, 256))  # [D6]
+    long_side = np.median(raw["wh"].max(1))  # px
+    side = int(np.clip(long_side / 2, 64, 256))  # [D6]
     thumbs = []
     for pixels, (w, h) in zip(np.split(raw["rgb"], raw["start"][1:]), raw["wh"]):
         photo = pixels.reshape(h, w, 3)
@@ -906,8 +906,8 @@ class TransientMask(nn.Module):
 
     def price(self, phi, lam_mask, lam_gpl):
         """The error (R,) above which a ray is transient. [D7]"""
-        usual = (lam_mask + self.sfm_error).clamp(min=LEAST_PRICE)
-        return usual + lam_gpl * phi
+        price = (lam_mask + self.sfm_error).clamp(min=LEAST_PRICE)
+        return price + lam_gpl * phi
 
 
 # ---- 7 The model and its objective ---------------------------------------------------------------

@@ -407,15 +407,15 @@ def test_every_landmark_is_another_building_that_stands_in_the_unit_sphere(numbe
     {}, dict(background=False), dict(occluders=.2, background=False)])
 def test_background_is_one_colour_exactly_when_most_rays_beyond_the_sphere_agree(knobs):
     scene = toy(**knobs)
-    seen = []
+    beyond = []
     for i in np.flatnonzero(~scene["is_test"]):
         o, d, _ = pixel_rays(scene, i)
         misses = np.linalg.norm(np.cross(o, d), axis=1) > 1
-        seen.append(photo(scene, i).reshape(-1, 3)[misses] / 255)
-    seen = np.concatenate(seen)
-    typical = np.median(seen, 0)
-    agree = (np.abs(seen - typical) < .02).all(1).mean()
-    is_one = agree > .6 and len(seen) > 100   # in the last scene too few
+        beyond.append(photo(scene, i).reshape(-1, 3)[misses] / 255)
+    beyond = np.concatenate(beyond)
+    typical = np.median(beyond, 0)
+    agree = (np.abs(beyond - typical) < .02).all(1).mean()
+    is_one = agree > .6 and len(beyond) > 100   # in the last scene too few
     np.testing.assert_allclose(scene["bg_color"], typical if is_one else [np.nan] * 3)
 
 
@@ -712,9 +712,9 @@ def write_model(folder, model):
     for key, c in model.cameras.items():
         files["cameras"].append(pack(f"iiQQ{len(c.numbers)}d", key, c.model, c.w, c.h, *c.numbers))
     for i in reversed(model.images.values()):
-        seen = b"".join(pack("ddQ", 1.5, 2.5, key) for key in i.points)
+        sightings = b"".join(pack("ddQ", 1.5, 2.5, key) for key in i.points)
         head = pack("I7dI", i.id, *i.q, *i.t, i.camera) + i.name.encode()
-        files["images"].append(head + pack("xQ", len(i.points)) + seen)
+        files["images"].append(head + pack("xQ", len(i.points)) + sightings)
     for p in model.points:
         n = len(p.track)
         record = pack(f"Q3d3BdQ{n}I", p.id, *p.x, 1, 2, 3, p.error, n // 2, *p.track)
@@ -804,21 +804,23 @@ def test_modes_and_rotations_of_photos_change_nothing(model, mode, kind):
     assert np.abs(photo(before, 0).astype(float) - photo(after, 0)).mean() < 3
 
 
-@pytest.mark.parametrize("number, bend", [
+@pytest.mark.parametrize("number, distortion", [
     (2, (.2,)), (3, (-.15, .02)), (4, (.1, 0, .01, -.01)), (6, (.1, 0, .01, -.01, 0, 0, 0, 0))])
-def test_an_undistorted_photo_shows_nothing_but_photo_where_its_camera_says(model, number, bend):
+def test_an_undistorted_photo_shows_nothing_but_photo_where_its_camera_says(
+        model, number, distortion):
     v, u = np.mgrid[:60, :90] + .5
     cv2.imwrite(str(PHOTO), (u + 2 * v).round().astype(np.uint8))
     focal = [70, 72][number <= 3:]
-    numbers = *focal, 44, 31, *bend
+    numbers = *focal, 44, 31, *distortion
     model.cameras[7] = SimpleNamespace(model=number, w=90, h=60, numbers=numbers)
     write_model(SPARSE, model)
     scene = data_prep.prepare("place", 1)
     fx, fy, cx, cy = scene["K"][0]
     d = np.stack([(u - cx) / fx, (v - cy) / fy, np.ones_like(u)], 2).reshape(-1, 3)
     M = np.array([[focal[0], 0, 44], [0, focal[-1], 31], [0, 0, 1.0]])
-    bent, _ = cv2.projectPoints(d, np.zeros(3), np.zeros(3), M, np.append(bend, np.zeros(8))[:8])
-    wanted = bent.reshape(60, 90, 2) @ (1, 2)
+    padded = np.append(distortion, np.zeros(8))[:8]
+    wanted, _ = cv2.projectPoints(d, np.zeros(3), np.zeros(3), M, padded)
+    wanted = wanted.reshape(60, 90, 2) @ (1, 2)
     miss = photo(scene, 0)[..., 0] - wanted
     assert np.abs(miss).max() < 3
     assert abs(miss.mean()) < .3   # half a pixel would be 1.5
@@ -2190,8 +2192,8 @@ def test_a_step_is_finite_whatever_the_sdf_and_its_sharpness(warm, distance, zet
 @pytest.mark.parametrize("setting", ["auto", "on", "off"])
 @pytest.mark.parametrize("spread, blue", [(0.009, 0.6), (0.011, math.nan)])
 def test_codes_and_background_follow_the_scene_unless_they_are_set(scene, setting, spread, blue):
-    facts = dict(exposure_spread=spread, bg_color=np.array([0.2, 0.4, blue]))
-    other = scene._replace(raw=scene.raw | facts)
+    statistics = dict(exposure_spread=spread, bg_color=np.array([0.2, 0.4, blue]))
+    other = scene._replace(raw=scene.raw | statistics)
     model = make_model(other, appearance=setting, background=setting)
     has_both = spread > 0.01 if setting == "auto" else setting == "on"
     assert model.codes().shape == (8, 4 * has_both)
