@@ -1548,6 +1548,18 @@ def test_a_ray_is_in_the_unit_sphere_exactly_within_its_interval(double):
     assert (t0 <= t1).all()
 
 
+@pytest.mark.parametrize("long_side, wanted", [(100, 64), (300, 150), (600, 256)])
+def test_the_mask_sees_photos_at_half_their_size_within_bounds(long_side, wanted):
+    raw = toy()
+    count = len(raw["wh"])
+    pixels = 2 * long_side
+    wh = np.tile([long_side, 2], (count, 1))
+    start = pixels * np.arange(count + 1)
+    rgb = np.zeros((count * pixels, 3), np.uint8)
+    scene = geonvs.load_scene(raw | dict(wh=wh, start=start, rgb=rgb))
+    assert scene.thumbs.shape == (count, 3, wanted, wanted)
+
+
 # ---- 3 octree ------------------------------------------------------------------------------------
 
 def make_tree(share=0.4, half=1.5, root=3):
