@@ -712,15 +712,14 @@ def direction_code(d):
 
 
 def render_rays(model, rays, code, jitter):
-    """One ray batch through the whole model. code: (R,A) appearance; jitter in 0..1, S columns for
-    the foreground, of which the first is not used, then the background's. Returns a dictionary: rgb
-    (R,3); opacity (R,); depth (R,) and end (R,3), where the ray ends on average, both without
-    gradient; normal (R,3), e_grad and e_curv (R,) at that end; t (R,S+1) of the samples."""
+    """One ray batch through the whole model. code: (R,A) appearance; jitter in 0..1: S - 1 columns
+    for the foreground, then the background's. Returns a dictionary: rgb (R,3); opacity (R,); depth
+    (R,) and end (R,3), where the ray ends on average, both without gradient; normal (R,3), e_grad
+    and e_curv (R,) at that end; t (R,S+1) of the samples."""
     S = model.cfg.samples
     zeta = model.deviation()
+    inner, outer = jitter.split([S - 1, model.cfg.bg_samples], 1)
     t0, t1 = sphere_interval(rays)  # (R,1)
-    inner = jitter[:, 1:S].contiguous()  # (R,S-1)
-    outer = jitter[:, S:]
     t = model.cache.distances(rays, t0, t1, inner, zeta)  # (R,S+1)
     x = rays.at(t).flatten(0, 1)  # (R(S+1),3)
     sdf, geo = model.sdf(x)  # (R(S+1),), (R(S+1),G)
@@ -982,7 +981,7 @@ class GeoNVS(nn.Module):
         cfg = self.cfg
         R = len(rays.o)
         code = self.appearance(photos).repeat_interleave(R // len(photos), 0)  # (R,A)
-        jitter = uniform(gen, R, cfg.samples + cfg.bg_samples)
+        jitter = uniform(gen, R, cfg.samples - 1 + cfg.bg_samples)
         out = render_rays(self, rays, code, jitter)
         residual = (out["rgb"] - rays.rgb).abs()  # (R,3)
 
@@ -1101,7 +1100,7 @@ class GeoNVS(nn.Module):
 
     def render(self, rays, code):
         """render_rays without jitter, for pictures and for fitting codes."""
-        draws = self.cfg.samples + self.cfg.bg_samples
+        draws = self.cfg.samples - 1 + self.cfg.bg_samples
         jitter = code.new_full((len(code), draws), 0.5)
         out = render_rays(self, rays, code, jitter)
         out["normal"] = out["normal"] * out["opacity"][:, None]  # 0 where nothing is
@@ -1158,7 +1157,7 @@ class EnergyMeter:
 
 REFINE_AT = (0.1, 0.2, 0.3, 0.45, 0.6)  # shares of training at which the octree is refined
 PAUSE = 30  # seconds between lines of the log; a checkpoint is made with each
-START = dict(step=0, refined=0, seconds=0.0, joules=0.0)  # what a run has done so far
+START = dict(step=0, seconds=0.0, joules=0.0)  # what a run has done so far
 RESULTS = ("checkpoint.pt", "log.jsonl", "metrics.json", "panel.png", "mesh.ply", "film.mp4")
 # torchrun starts RANKS processes. Each draws its own rays and follows its own prices, the gradients
 # are averaged, the first process decides, speaks and writes; so all hold the same weights.
@@ -1199,6 +1198,13 @@ def training_step(model, optimizer, photos, step, done, gen):
     optimizer.step()
     model.observe(rays, out)
     return terms
+
+
+def share_done(cfg, state):
+    """Share of training that is done, of steps or minutes; 1 or more: it is over."""
+    if cfg.minutes > 0:
+        return state["seconds"] / (60 * cfg.minutes)
+    return state["step"] / cfg.steps
 
 
 def make_optimizer(model):
@@ -1278,16 +1284,19 @@ def train(cfg, scene, run, saved=None, kind=GeoNVS):
     photos = scene.photos(False)
     begin = time.perf_counter() - state["seconds"]
     next_log = 0.0
+    before = share_done(cfg, state)
     terms = {}
     while True:
         if RANKS == 1 or state["step"] % 16 == 0:  # processes agree on time now and then
             state["seconds"] = from_first_process(time.perf_counter() - begin)
-        done = state["step"] / cfg.steps
-        if cfg.minutes > 0:
-            done = state["seconds"] / (60 * cfg.minutes)
+        done = share_done(cfg, state)
+        if any(before < share <= done for share in REFINE_AT):
+            model.refine(optimizer)
+        if before < REFINE_AT[-1] <= done:
+            model.decide_mask()
+        before = done
         if done >= 1:
             state["seconds"] = from_first_process(time.perf_counter() - begin)
-            model.decide_mask()  # in a run of a step or two it has not been
         is_due = done >= 1 or state["seconds"] >= next_log
         if RANK == 0 and terms and is_due:
             next_log = state["seconds"] + PAUSE
@@ -1299,12 +1308,6 @@ def train(cfg, scene, run, saved=None, kind=GeoNVS):
             return model, state
         terms = training_step(model, optimizer, photos, state["step"], done, gen)
         state["step"] += 1
-        due = sum(done >= share for share in REFINE_AT)
-        if state["refined"] < due:
-            state["refined"] = due
-            model.refine(optimizer)
-            if due == len(REFINE_AT):
-                model.decide_mask()
 
 
 @torch.no_grad()
