@@ -92,7 +92,7 @@ AT_LEAST = dict(
     downscale=1,
     rays=2,
     photos=1,
-    samples=3,
+    samples=3,  # with fewer, zeta's upper bound would lie below its floor
     bg_samples=6,
     hidden=1)
 
@@ -288,11 +288,6 @@ class WeightedSum(torch.autograd.Function):
         return out, None, None
 
 
-def constant(*values):
-    """A tensor that moves along with its module, and is not saved."""
-    return nn.Buffer(torch.tensor(values), persistent=False)
-
-
 def grid_index(n, device):
     """All index triples (n^3,3) of a cube of n^3 cells, the last index fastest."""
     axis = torch.arange(n, device=device)
@@ -309,12 +304,13 @@ class Octree(nn.Module):
         super().__init__()
         self.half = half
         self.levels = levels
+        self.width = levels * channels  # LC
         self.root = root
         self.features = nn.Parameter(torch.zeros(1, channels))  # (V,C)
         self.corner_key = torch.tensor([-1])  # (V,) the corner that owns a row
-        self.row_stride = constant(root**2, root, 1)
-        self.octant_stride = constant(4, 2, 1)
-        self.resolution = nn.Buffer(root * 2.0 ** torch.arange(levels), persistent=False)  # (L,)
+        self.row_stride = torch.tensor([root**2, root, 1])
+        self.octant_stride = torch.tensor([4, 2, 1])
+        self.resolution = root * 2.0 ** torch.arange(levels)  # (L,)
         self.build(self.corner_key)  # no cell has the key -1: none is split
 
     def side(self, level):
@@ -350,11 +346,11 @@ class Octree(nn.Module):
             children = 2 * index[is_split][:, None] + octants  # (N,8,3)
             index = children.flatten(0, 1)
         self.cells = torch.cat(levels)  # (N,4) level, i, j, k
-        self.finest = self.cells[-1, 0].item()  # level
+        self.finest = self.side(self.cells[-1, 0].item())  # side of the smallest cell
         is_split = torch.cat(splits)
         first = self.root**3 + 8 * (is_split.cumsum(0) - 1)  # (N,) children follow each other
         self.child = torch.where(is_split, first, 0).int()  # (N,) 0: none
-        self.ends = nn.Buffer(torch.zeros(len(first), 3, device=first.device))  # (N,3) see record
+        self.ends = nn.Buffer(torch.zeros(len(first), 3, device=first.device))  # (N,3) see observe
 
         corners = self.cells[:, None] + F.pad(octants, (1, 0))  # (N,8,4)
         key = self.key(corners)  # (N,8)
@@ -401,14 +397,7 @@ class Octree(nn.Module):
         w = w * exists.reshape(-1, 1)
         corner = self.corner.index_select(0, node)  # (PL,8)
         out = WeightedSum.apply(self.features, corner, w)  # (PL,C)
-        return out.reshape(len(x), -1)
-
-    def record(self, x, error, pixel, weight):
-        """Adds to the columns of the cells in which rays end, at x (P,3): error, size of a pixel
-        there, both times weight (P,), and weight."""
-        node, _, _ = self.locate(x)
-        columns = torch.stack([error, pixel, torch.ones_like(error)], 1)  # (P,3)
-        self.ends.index_add_(0, node[:, -1], weight[:, None] * columns)
+        return out.reshape(len(x), self.width)
 
 
 def nearest_row(sorted_keys, key):
@@ -460,12 +449,12 @@ def refined_keys(octree, sdf, zeta):
     can_split = (s < reach) & ~is_split & (level < octree.levels - 1)
     is_coarse = pixel < count * side / 2  # mean size of a pixel under a child's side
     error = error * (can_split & is_coarse)
-    worst = error.argsort(descending=True)  # (N,)
-    before = error[worst].cumsum(0) - error[worst]  # (N,) what worse cells hold
-    wanted = int((before < ERROR_SHARE * error.sum()).sum())
+    enough = ERROR_SHARE * error.sum()
+    error, worst = error.sort(descending=True)  # (N,)
+    before = error.cumsum(0) - error  # (N,) what worse cells hold
     room = max(0, MAX_CELLS - len(level)) // 8
     is_split &= s < reach + HIDDEN / zeta
-    is_split[worst[:min(wanted, room)]] = True
+    is_split[worst[before < enough][:room]] = True
     return octree.key(octree.cells[is_split])
 
 
@@ -522,19 +511,16 @@ class SDFField(nn.Module):
     def __init__(self, octree, hidden):
         super().__init__()
         self.octree = octree
-        self.features = octree.features.shape[1] * octree.levels  # LC
-        self.lin1 = nn.Linear(3 + self.features, hidden)
-        self.lin2 = nn.Linear(hidden, 1 + GEO)
-        nn.init.normal_(self.lin2.weight[0], std=0.01)
-        nn.init.zeros_(self.lin2.bias)
-        self.taps = constant(*TAPS)  # (5,3)
+        self.network = mlp(3 + octree.width, hidden, 1 + GEO)
+        nn.init.normal_(self.network[2].weight[0], std=0.01)
+        nn.init.zeros_(self.network[2].bias)
+        self.taps = torch.tensor(TAPS)  # (5,3)
 
     def forward(self, x):
         """sdf (P,) and geometry (P,G) at x (P,3)."""
         feat = self.octree(x)  # (P,LC)
         inputs = torch.cat([x, feat], 1)  # (P,3+LC)
-        h = F.relu(self.lin1(inputs))  # (P,H)
-        change, geo = self.lin2(h).split([1, GEO], 1)  # (P,1), (P,GEO)
+        change, geo = self.network(inputs).split([1, GEO], 1)  # (P,1), (P,GEO)
         sdf = x.norm(dim=1) - SPHERE + change[:, 0]  # (P,)
         return sdf, torch.cat([geo, feat], 1)
 
@@ -579,7 +565,7 @@ class Deviation(nn.Module):
     def bound(self, done, most):
         """Clamps zeta. The floor rises from 15 to 80 in the first 43 % of training (done: 0..1):
         soft walls hide people from the mask, and people in the picture keep walls soft. Above
-        `most` a wall is thinner than the gap between samples; no gradient could move it. [D14]"""
+        `most` a wall is far thinner than a section between samples; no gradient moves it. [D14]"""
         floor = 15 + 65 * min(done / 0.43, 1.0)
         self.v.clamp_(math.log(floor) / 10, math.log(most) / 10)
 
@@ -632,7 +618,7 @@ class SDFCache(nn.Module):
         line = torch.linspace(-1, 1, n, device=self.volume.device)  # (n,)
         x = torch.cartesian_prod(line, line, line)  # (P,3)
         s = in_chunks(sdf, x)  # (P,)
-        self.volume.copy_(s.reshape(self.volume.shape))
+        self.volume.copy_(s.view_as(self.volume))
 
     def sdf(self, x):
         """s (R,N) at x (R,N,3), trilinear."""
@@ -669,8 +655,7 @@ class Background(nn.Module):
         super().__init__()
         self.octree = Octree(2.0, levels, root=32)
         seed_octree(self.octree, contract(points), dense=0, near=levels - 1)  # SfM points (K,3)
-        features = self.octree.features.shape[1] * self.octree.levels
-        self.density = mlp(3 + features, hidden, 1 + GEO)
+        self.density = mlp(3 + self.octree.width, hidden, 1 + GEO)
         self.color = mlp(GEO + per_ray, hidden, 3)
 
     def forward(self, rays, t0, t1, per_ray, jitter):
@@ -714,8 +699,8 @@ def direction_code(d):
 def render_rays(model, rays, code, jitter):
     """One ray batch through the whole model. code: (R,A) appearance; jitter in 0..1: S - 1 columns
     for the foreground, then the background's. Returns a dictionary: rgb (R,3); opacity (R,); depth
-    (R,) and end (R,3), where the ray ends on average, both without gradient; normal (R,3), e_grad
-    and e_curv (R,) at that end; t (R,S+1) of the samples."""
+    (R,) and end (R,3), where the ray ends on average, both without gradient; normal (R,3), times
+    opacity, e_grad and e_curv (R,) at that end; t (R,S+1) of the samples."""
     S = model.cfg.samples
     zeta = model.deviation()
     inner, outer = jitter.split([S - 1, model.cfg.bg_samples], 1)
@@ -729,6 +714,7 @@ def render_rays(model, rays, code, jitter):
     at_far_end = F.pad(w, (1, 0))
     w = (at_far_end + at_near_end) / 2  # (R,S+1) of samples: half of their two sections' [D2]
 
+    opacity = 1 - trans
     depth = (w * t).sum(1) + trans * t1[:, 0]
     depth = depth.detach()  # (R,)
     end = rays.at(depth[:, None])[:, 0]  # (R,3)
@@ -749,12 +735,12 @@ def render_rays(model, rays, code, jitter):
         rgb = front + passes * rgb + trans[:, None] * behind
     return dict(
         rgb=rgb,
-        opacity=1 - trans,
+        opacity=opacity,
         depth=depth,
         end=end,
-        normal=normal,
+        normal=normal * opacity[:, None],  # 0 where nothing is
         e_grad=eikonal(grad),
-        e_curv=lap.abs() * model.eps * (1 - trans.detach()),  # [D4]
+        e_curv=lap.abs() * model.eps * opacity.detach(),  # [D4]
         t=t)
 
 
@@ -860,13 +846,13 @@ def reject_outliers(mask, is_outlier, done):
     return torch.where(is_outlier & (mask > suspicion), 1.0, mask)
 
 
-def follow_quantiles(running, shares, values, is_chosen, rate=0.1):
+def follow_quantiles(running, shares, values, is_chosen):
     """Moves `running` (Q,), above 0, by a factor towards the quantiles `shares` (Q,) of the chosen
     values (R,): up where too many of them lie above it."""
     is_below = (values[:, None] < running) & is_chosen[:, None]  # (R,Q)
     count = is_chosen.sum()
     excess = (count * shares - is_below.sum(0)) / count.clamp(min=1)  # (Q,) 0 if none is chosen
-    running *= torch.exp(rate * excess)
+    running *= torch.exp(0.1 * excess)
 
 
 class TransientMask(nn.Module):
@@ -874,8 +860,8 @@ class TransientMask(nn.Module):
     def __init__(self, scene):
         super().__init__()
         self.cgnet = CGNet()
-        self.thumbs = nn.Buffer(scene.thumbs, persistent=False)
-        self.shares = constant(0.5, 0.75, 0.95)
+        self.thumbs = scene.thumbs
+        self.shares = torch.tensor([0.5, 0.75, 0.95])
         self.complexity = nn.Buffer(torch.tensor([0.5, 1.0, 4.0]))  # (3,) of foreground rays
         self.sfm_error = nn.Buffer(torch.tensor([0.3]))  # (1,) upper quartile at SfM pixels
         # which pixels of small photos show SfM points; some wrongly, at outlines [D10]
@@ -885,7 +871,7 @@ class TransientMask(nn.Module):
         is_seen = ((uv >= 0) & (uv < 1)).all(1)  # (T,)
         col, row = (uv[is_seen] * n).long().unbind(1)
         static[scene.track_photo[is_seen].long(), row, col] = True
-        self.static = nn.Buffer(static, persistent=False)
+        self.static = static
 
     def logits(self, photos):
         """Logits (B,1,m,m) of photos (B,)."""
@@ -930,18 +916,17 @@ class GeoNVS(nn.Module):
         levels = cfg.levels
         if levels == 0:  # no cell smaller than a pixel [D15]
             pixels = 2 / raw["footprint"]  # from side to side
-            levels = 1 + math.floor(math.log2(pixels / ROOT))
-            levels = min(max(levels, 2), 8)
+            levels = int(np.clip(1 + np.log2(pixels / ROOT), 2, 8))
         A = 0
         if is_on(cfg.appearance, raw["exposure_spread"] > 0.01):
             A = cfg.appearance_dim
         is_inside = scene.points.norm(dim=1) < 1
-        self.sfm = nn.Buffer(scene.points[is_inside], persistent=False)  # (K,3)
+        self.sfm = scene.points[is_inside]  # (K,3)
         octree = Octree(1.0, levels)
         seed_octree(octree, self.sfm, dense=1, near=1)
         self.sdf = SDFField(octree, cfg.hidden)
         self.color = nn.Sequential(
-            LipschitzLinear(GEO + self.sdf.features + 3 + 9 + A, cfg.hidden),
+            LipschitzLinear(GEO + octree.width + 3 + 9 + A, cfg.hidden),
             nn.ReLU(),
             LipschitzLinear(cfg.hidden, cfg.hidden),
             nn.ReLU(),
@@ -951,24 +936,22 @@ class GeoNVS(nn.Module):
         nn.init.normal_(self.appearance.weight, std=0.01)
         self.octrees = [octree]
         self.background = None
-        self.bg_color = constant(*np.nan_to_num(raw["bg_color"], nan=0.5).tolist())
-        has_colors = bool(np.isnan(raw["bg_color"]).any())  # nan: it has no one colour
+        self.bg_color = torch.tensor(np.nan_to_num(raw["bg_color"], nan=0.5).tolist())
+        has_colors = np.isnan(raw["bg_color"]).any()  # nan: it has no one colour
         if is_on(cfg.background, has_colors):
             points = scene.points[~is_inside]
             self.background = Background(points, cfg.hidden, 9 + A, min(levels, 4))
             self.octrees.append(self.background.octree)
         self.deviation = Deviation()
         self.mask = TransientMask(scene)
-        finest = ROOT * 2 ** (levels - 1)  # cells along an axis
-        self.cache = SDFCache(min(max(finest, 64), 128))
+        self.cache = SDFCache(64 if levels < 4 else 128)  # as fine as the octree, within bounds
         self.cache.refresh(self.distance)
-        print(f"  {levels} levels, appearance code of {A}, {len(self.octrees)} octrees")
+        print(f"  octree levels: {levels}, appearance code: {A}, octrees: {len(self.octrees)}")
 
     @property
     def eps(self):
         """Length of the taps of finite differences: half of the finest cell there is."""
-        octree = self.sdf.octree
-        return octree.side(octree.finest) / 2
+        return self.sdf.octree.finest / 2
 
     def distance(self, x):
         """s (P,) at x (P,3)."""
@@ -1009,13 +992,11 @@ class GeoNVS(nn.Module):
         points = torch.cat([taps.flatten(0, 1), sfm])
         s_taps, s_sfm = self.distance(points).split([5 * N, N])
         grad, _ = finite_differences(s_taps.reshape(N, 5), self.sdf.taps, self.eps)
-        eik_end = out["e_grad"].mean()
-        eik_sample = eikonal(grad).mean()
         pull = self.deviation().detach().clamp(max=40)  # [D10]
 
         terms = dict(
             rgb=((1 - mask) * residual.mean(1)).mean(),
-            eik=(eik_end + eik_sample) / 2,
+            eik=(out["e_grad"].mean() + eikonal(grad).mean()) / 2,
             curv=out["e_curv"].mean(),  # [D4]
             lps=lipschitz_loss(self.color),
             sfm=pull * s_sfm.abs().mean(),
@@ -1046,7 +1027,10 @@ class GeoNVS(nn.Module):
         follow_quantiles(mask.sfm_error, mask.shares[1:2], out["error"], out["is_static"])
         pixel = out["depth"] / self.scene.K[rays.img, 0]  # (R,) its size at the ray's end
         error = (1 - out["mask"]) * out["error"]
-        self.sdf.octree.record(out["end"], error, pixel, is_solid.float())
+        columns = torch.stack([error, pixel, torch.ones_like(error)], 1)  # (R,3)
+        octree = self.sdf.octree
+        node, _, _ = octree.locate(out["end"])
+        octree.ends.index_add_(0, node[:, -1], is_solid[:, None] * columns)
 
     def batch(self, photos, n, gen):
         """n random rays and the photos (B,) they come from, photo by photo."""
@@ -1062,8 +1046,8 @@ class GeoNVS(nn.Module):
         codes = [self.appearance.weight]
         mask = list(self.mask.parameters())
         zeta = [self.deviation.v]
-        special = {id(p) for p in grids + codes + mask + zeta}
-        networks = [p for p in self.parameters() if id(p) not in special]
+        special = set(grids + codes + mask + zeta)
+        networks = [p for p in self.parameters() if p not in special]
         return [
             dict(params=networks, lr=self.cfg.lr_net),
             dict(params=grids, lr=self.cfg.lr_grid),
@@ -1102,9 +1086,7 @@ class GeoNVS(nn.Module):
         """render_rays without jitter, for pictures and for fitting codes."""
         draws = self.cfg.samples - 1 + self.cfg.bg_samples
         jitter = code.new_full((len(code), draws), 0.5)
-        out = render_rays(self, rays, code, jitter)
-        out["normal"] = out["normal"] * out["opacity"][:, None]  # 0 where nothing is
-        return out
+        return render_rays(self, rays, code, jitter)
 
 
 # ---- 8 Energy ------------------------------------------------------------------------------------
@@ -1287,7 +1269,8 @@ def train(cfg, scene, run, saved=None, kind=GeoNVS):
     before = share_done(cfg, state)
     terms = {}
     while True:
-        if RANKS == 1 or state["step"] % 16 == 0:  # processes agree on time now and then
+        # several processes agree on time now and then, and at the last step
+        if RANKS == 1 or state["step"] % 16 == 0 or state["step"] == cfg.steps:
             state["seconds"] = from_first_process(time.perf_counter() - begin)
         done = share_done(cfg, state)
         if any(before < share <= done for share in REFINE_AT):
@@ -1295,8 +1278,6 @@ def train(cfg, scene, run, saved=None, kind=GeoNVS):
         if before < REFINE_AT[-1] <= done:
             model.decide_mask()
         before = done
-        if done >= 1:
-            state["seconds"] = from_first_process(time.perf_counter() - begin)
         is_due = done >= 1 or state["seconds"] >= next_log
         if RANK == 0 and terms and is_due:
             next_log = state["seconds"] + PAUSE
@@ -1437,8 +1418,9 @@ def evaluate(model, scene, lpips=None):
     rows = []
     for photo in progress(photos.tolist(), "scoring held-out photos"):
         frame = render_photo(model, scene, photo, codes[photo])
-        name = str(scene.raw["name"][photo])
-        rows.append(dict(name=name) | score(frame, lpips))
+        row = score(frame, lpips)
+        row["name"] = str(scene.raw["name"][photo])
+        rows.append(row)
     scores = dict(per_image=rows)
     for key in ("psnr", "psnr_floor", "ssim", "lpips"):
         values = [row[key] for row in rows if row[key] is not None]
@@ -1466,15 +1448,13 @@ def toy_truth(model, scene):
     if model.cfg.mask == "off":
         return truth
     masks = []
-    people = []
     for photo in scene.photos(False).tolist():
         logits = model.mask.logits([photo])
         M = sample_logits(logits, photo_rays(scene, photo).uv).sigmoid()
         masks.append(M.cpu().numpy())
-        pixels = slice(*raw["start"][photo:photo + 2])
-        people.append(raw["occluder"][pixels])
     mask = np.concatenate(masks)
-    people = np.concatenate(people)
+    is_training = np.repeat(~raw["is_test"], np.diff(raw["start"]))  # by pixel
+    people = raw["occluder"][is_training]
     truth["mask_static"] = float(mask[~people].mean())
     if people.any():
         found = mask > 0.5
@@ -1490,8 +1470,7 @@ def extract_mesh(model):
     gives its sign."""
     n = min(round(2 / model.eps), 512)
     cache = model.cache.volume
-    size = [n + 1] * 3
-    volume = F.interpolate(cache, size=size, mode="trilinear", align_corners=True)[0, 0]
+    volume = F.interpolate(cache, size=n + 1, mode="trilinear", align_corners=True)[0, 0]
     near = volume.abs() < 6 / cache.shape[-1]
     x = near.nonzero() * (2 / n) - 1  # (P,3)
     volume[near] = in_chunks(model.distance, x)
@@ -1503,7 +1482,7 @@ def extract_mesh(model):
         return empty, empty, empty
     vertices, faces, _, _ = marching_cubes(volume, 0, mask=is_inside)
     vertices = vertices * (2 / n) - 1
-    x = torch.tensor(vertices, dtype=torch.float32, device=cache.device)
+    x = torch.tensor(vertices, device=cache.device)
     colors = in_chunks(lambda part: surface_color(model, part), x)
     raw = model.scene.raw
     return vertices * raw["scale"] + raw["center"], faces, to_uint8(colors.cpu())
@@ -1570,7 +1549,8 @@ def write_panel(path, model, scene, codes, width=240):
 def finish(model, scene, state, run):
     """Scores a trained model and writes metrics.json, panel.png and mesh.ply below run."""
     device = scene.c2w.device
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024  # before scoring
+    unit = 1 if sys.platform == "darwin" else 1024  # bytes
+    peak = unit * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss  # before scoring
     machine = f"cpu, {torch.get_num_threads()} threads"
     if device.type == "cuda":
         peak = torch.cuda.max_memory_allocated(device)
@@ -1613,9 +1593,9 @@ def finish(model, scene, state, run):
 def in_between(keys, n):
     """n rows (n,D) evenly along the polyline through keys (B,D)."""
     at = torch.linspace(0, len(keys) - 1, n, device=keys.device)
-    left = at.floor()
-    right = at.ceil()
-    return torch.lerp(keys[left.long()], keys[right.long()], (at - left)[:, None])
+    left = keys[at.long()]
+    right = keys[at.ceil().long()]
+    return torch.lerp(left, right, at.frac()[:, None])
 
 
 def film(model, scene, path):
@@ -1665,9 +1645,7 @@ def make_parser():
 def pick_device(name):
     """The device of this process: with torchrun each has its own GPU."""
     count = torch.cuda.device_count()
-    if name == "auto":
-        name = "cuda" if count > 0 else "cpu"
-    if name == "cpu":
+    if name == "cpu" or (name == "auto" and count == 0):
         return torch.device("cpu")
     check(LOCAL_RANK < count, f"--device cuda: {count} GPUs are here for {RANKS} processes")
     return torch.device("cuda", LOCAL_RANK)

@@ -1807,10 +1807,10 @@ def test_contraction_keeps_the_unit_ball_and_ends_at_two():
 
 def plain_sdf(model, x):
     """s () and geometry (G,) at x (3,)."""
-    sdf = model.sdf
+    first, _, last = model.sdf.network
     features = model.plain[0](x)
-    h = sdf.lin1.weight @ torch.cat([x, features]) + sdf.lin1.bias
-    out = sdf.lin2.weight @ h.relu() + sdf.lin2.bias
+    h = first.weight @ torch.cat([x, features]) + first.bias
+    out = last.weight @ h.relu() + last.bias
     return x.norm() - 0.25 + out[0], torch.cat([out[1:], features])
 
 
@@ -1913,7 +1913,7 @@ def plain_render(model, ray, t, t0, t1, code, jitter):
         opacity=opacity,
         depth=depth,
         end=end,
-        normal=normal,
+        normal=opacity * normal,
         e_grad=(grad.norm() - 1) ** 2,
         e_curv=6 * rise.abs() / model.eps * opacity.detach())
 
@@ -2195,8 +2195,8 @@ def test_the_objective_and_its_gradients_equal_plain_loops(
 @pytest.mark.parametrize("distance", [-1e3, -1e-6, 0.0, 1e-6, 1e3])
 def test_a_step_is_finite_whatever_the_sdf_and_its_sharpness(warm, distance, zeta):
     rays, photos = make_batch(warm)
-    warm.sdf.lin2.weight.data *= 1e-3
-    warm.sdf.lin2.bias.data.fill_(distance)
+    warm.sdf.network[2].weight.data *= 1e-3
+    warm.sdf.network[2].bias.data.fill_(distance)
     warm.deviation.v.data.fill_(math.log(zeta) / 10)
     total, _, _ = warm.losses(rays, photos, 0, generator())
     assert total.isfinite()
@@ -2798,7 +2798,7 @@ def train_as_one_of_two():
         rays.append(make_rays(*args))
         return rays[-1]
     patch.setattr(geonvs, "make_rays", noted_rays)
-    model, _ = run_training(geonvs.load_scene(toy()), Path("run"), minutes=1.0)
+    model, _ = run_training(geonvs.load_scene(toy()), Path("run"), minutes=1.0, steps=99)
     layer = torch.nn.Linear(1, 1, bias=False)
     layer.weight.grad = torch.full((1, 1), 1.0 + geonvs.RANK)
     geonvs.average_gradients(layer)
@@ -3072,7 +3072,8 @@ def test_a_plane_of_a_mesh_ends_at_the_unit_sphere_in_cells_of_eps(warm, scene, 
 
 @pytest.mark.parametrize("radius", [-0.1, 1.2])
 def test_a_field_without_a_surface_in_the_sphere_has_an_empty_mesh(warm, tmp_path, radius):
-    warm.distance = lambda x: x.norm(dim=1) - radius
+    warm.sdf.network[2].weight.data.zero_()
+    warm.sdf.network[2].bias.data.fill_(0.25 - radius)  # s = |x| - radius
     warm.cache.refresh(warm.distance)
     mesh = geonvs.extract_mesh(warm)
     geonvs.write_ply(tmp_path / "a.ply", *mesh)
@@ -3854,7 +3855,7 @@ class NoNormal(geonvs.GeoNVS):
 
     def hide_normal(self, _, inputs):
         x = inputs[0].clone()
-        begin = geonvs.GEO + self.sdf.features
+        begin = geonvs.GEO + self.sdf.octree.width
         x[:, begin:begin + 3] = 0
         return x
 
@@ -4027,7 +4028,7 @@ def summary(name, runs):
     for key in FIGURES:
         values = [run[key] for run in runs if run.get(key) is not None]
         line[key] = float(np.mean(values)) if values else None
-        line[key + "_std"] = float(np.std(values)) if len(values) > 1 else None
+        line[key + "_std"] = float(np.std(values, ddof=1)) if len(values) > 1 else None
     return line
 
 
