@@ -109,7 +109,7 @@ def atomic_write(path, write):
         path.parent.mkdir(parents=True, exist_ok=True)
         result = write(part)
         check(result is not False, f"cannot encode {path}")   # so cv2.imwrite says no
-        os.replace(part, path)
+        part.replace(path)
     except OSError as e:
         raise UserError(f"cannot write {path} ({e.strerror or e}): free or choose a place") from e
     finally:
@@ -163,7 +163,7 @@ def read_scene(path):
 
 # ---- the toy: z up, front towards -y, in its own units; world = TOY_SCALE * x + TOY_ORIGIN -------
 TOY_SCALE = 3.7
-TOY_ORIGIN = array([12.0, -7.0, 5.0])
+TOY_ORIGIN = 12.0, -7.0, 5.0
 SUN = array([-.50, -.62, .60])   # left, behind the tourists
 SUN /= norm(SUN)
 STONE, PALE, SAND, BRICK, ROOF, SLATE, COPPER, GOLD, HOUSE, LEAF, PAVING, MEADOW = range(12)
@@ -219,7 +219,14 @@ LANDMARK = table("""
     3   -.8  -.35   .64  .055  .055  .055  .055  6
 """)
 LANDMARK[2:8, 1] = np.linspace(-.54, .60, 6)   # the columns stand in a row
-GROUPS = (2, 16), (11, 16), (16, 19), (19, 21), (21, 24)   # on the plinth; of it the dome; ...
+# Groups of rows that are stretched and moved together: the first, and the one after the last.
+GROUPS = table("""
+     2  16   # what stands on the plinth
+    11  16   # of it the dome
+    16  19   # the tower
+    19  21   # the annex
+    21  24   # the statue
+""").astype(int)
 # The background: the ground, houses, each with a roof, and trees.
 TOWN = table("""
     0     0    0     0     1   1   1   1  10
@@ -250,7 +257,8 @@ TOWN = table("""
 """)
 TREES = TOWN[17:]   # yet with place and half width of the house that one stands before
 TREES[:, 3:8] *= .8
-TREES[:, 1:4] = TREES[:, 1:4] * (.8, .7, 1) + (1, 0, .2)
+TREES[:, 1:4] *= .8, .7, 1
+TREES[:, 1:4] += 1, 0, .2
 
 
 def toy_parts(landmark, background):
@@ -298,6 +306,12 @@ def part_sdf(part, x):
     d = hypot(maximum(d, 0), maximum(e, 0)) + minimum(maximum(d, e), 0)
     d = where(shape == 3, hypot(u, z) - bottom, d)
     return where(shape == 0, z, d)
+
+
+def gradient(sdf, x, step):
+    """Of a distance (P,) by central differences. x (P,3) -> (P,3)"""
+    ends = [sdf(x + axis) - sdf(x - axis) for axis in step * eye(3)]
+    return stack(ends, 1) / (2 * step)
 
 
 def toy_sdf(x_world, background=True, landmark=0):
@@ -381,14 +395,13 @@ def paint(x, part):
 
 
 def shade(o, d, parts, background, sun):
-    """Radiance along rays: sun, shadow, sky light and haze. o as in trace, sun (3,) -> (R,3)"""
+    """Radiance along rays: sun, shadow, sky light and haze. o (1,3), d (R,3), sun (3,) -> (R,3)"""
     colour = sky(d) * background
     t, which = trace(o, d, parts)
     hit = flatnonzero(t < inf)
-    x = np.broadcast_to(o, d.shape)[hit] + t[hit, None] * d[hit]
+    x = o + t[hit, None] * d[hit]
     part = parts[which[hit]]   # (H,9)
-    steps = 1e-5 * eye(3)
-    normal = stack([part_sdf(part, x + e) - part_sdf(part, x - e) for e in steps], 1) / 2e-5
+    normal = gradient(lambda x: part_sdf(part, x), x, 1e-5)
     in_sun = trace(x + 1e-4 * normal, sun[None], parts)[0] == inf
     light = (maximum(normal @ sun, 0) * in_sun)[:, None] * (1.15, 1.05, .88)
     light += (0.20 + 0.10 * normal[:, 2:]) * (.8, .92, 1.15)
@@ -397,11 +410,11 @@ def shade(o, d, parts, background, sun):
     return colour
 
 
-def rays(K, c2w, w, h, dx=0.5, dy=0.5):
-    """Unit directions of a photo's pixels in world axes, row by row. -> (h*w,3)"""
+def rays(K, c2w, w, h, offset=(0.5, 0.5)):
+    """Unit directions through each pixel's offset, in world axes, row by row. -> (h*w,3)"""
     v, u = np.mgrid[:h, :w].reshape(2, -1)
     d = np.ones((w * h, 3))
-    d[:, :2] = (stack([u + dx, v + dy], 1) - K[2:]) / K[:2]
+    d[:, :2] = (stack([u, v], 1) + offset - K[2:]) / K[:2]
     d /= norm(d, axis=1, keepdims=True)
     return d @ c2w[:, :3].T
 
@@ -451,10 +464,8 @@ STROKES = table("""
 def draw_people(rng, w, h, share):
     """Passers-by on about `share` of the photo. -> (h*w,4): colour times opacity, opacity"""
     canvas = np.zeros((4 * h, 4 * w, 4), np.float32)   # drawn large, then averaged
-    while True:
-        left = share - canvas[..., 3].mean()
-        if left <= max(0.1 * share, 0.002):
-            break
+    left = share
+    while left > max(0.1 * share, 0.002):
         tall = np.sqrt(left * w * h / .25) * rng.uniform(.5, 1)
         tall = 4 * clip(tall, .12 * h, .95 * h)
         feet = rng.uniform((0, 3.2 * h), (4 * w, 4 * h + .2 * tall))
@@ -469,23 +480,23 @@ def draw_people(rng, w, h, share):
             ends = feet + np.reshape(ends, (2, 2)) * (tall, -tall)
             thickness = int(wide * tall) + 1
             cv2.line(canvas, *ends.astype(int).tolist(), (*colour.tolist(), 1), thickness)
+        left = share - canvas[..., 3].mean()
     small = cv2.resize(canvas, (w, h), interpolation=cv2.INTER_AREA)
     return small.reshape(-1, 4).astype(float)
 
 
-def toy_points(rng, views, depths, people):
-    """As by SfM: noisy, 1.5 % wrong. -> points (K,5) as in finish, and those (M,) of each photo"""
+def toy_points(rng, photos):
+    """As by SfM: noisy, 1.5 % wrong. photos: of each its view, surface (P,3), depth and people (P,)
+    -> points (K,5) as in finish, and those (M,) of each photo"""
     x, tracks = [], []
-    photos = list(zip(views, depths, people))
     count = 3000 // len(photos)
-    for (K, c2w, w, h), depth, hidden in photos:
-        surface = c2w[:, 3] + rays(K, c2w, w, h) * depth[:, None]
+    for _, surface, depth, hidden in photos:
         ok = (depth < 30) & ~hidden
         on = ok & (abs(surface - (0, 0, 1.02)) < (1.3, 1.3, 1)).all(1)   # the landmark
         for some, n in (on, count), (ok & ~on, count // 5):
             x.append(surface[rng.choice(flatnonzero(some), n * some.any())])
     x = concatenate(x)
-    for (K, c2w, w, h), depth, hidden in photos:
+    for (K, c2w, w, h), _, depth, hidden in photos:
         uv, distance = project(K, c2w, x)
         at = clip(uv, 0, (w - 1, h - 1)).astype(int) @ (1, w)
         ok = ((uv >= 0) & (uv < (w, h))).all(1)
@@ -503,7 +514,7 @@ def shake_camera(rng, K, c2w, pixels):
     """Moves c2w, in the toy's units, by noise that is `pixels` rms at the landmark."""
     *turn, dx, dy = rng.normal(0, pixels / 2, 4) / K[0]   # half by turning, half by moving [rad]
     c2w[:, 3] += c2w[:, :2] @ (dx, dy) * norm(c2w[:, 3])
-    c2w[:, :3] @= cv2.Rodrigues(array([*turn, 0]))[0]
+    c2w[:, :3] @= cv2.Rodrigues((*turn, 0))[0]
 
 
 def make_toy(seed=0, size=96, photos=48, test=8, occluders=0.05, exposure=1.0, pose_noise=0.0,
@@ -528,14 +539,14 @@ def make_toy(seed=0, size=96, photos=48, test=8, occluders=0.05, exposure=1.0, p
     share = minimum(share / share.sum() * photos * occluders, 0.85)
     turns = radians(day.uniform(-sun, sun, count))
     parts = toy_parts(landmark, background)
-    depth, images, occluder = [], [], []
+    depth, surface, images, occluder = [], [], [], []   # of each photo
     for i in progress(range(count), "drawing photos"):
-        K, c2w, w, h = views[i]
+        _, c2w, w, h = views[i]
         o = c2w[None, :, 3]
-        to_sun = cv2.Rodrigues(array([0, 0, turns[i]]))[0] @ SUN
+        to_sun = cv2.Rodrigues((0, 0, turns[i]))[0] @ SUN
         linear = 0
-        for dx, dy in itertools.product((.25, .75), repeat=2):   # places in a pixel
-            d = rays(K, c2w, w, h, dx, dy)
+        for offset in itertools.product((.25, .75), repeat=2):   # places in a pixel
+            d = rays(*views[i], offset)
             linear += clip(shade(o, d, parts, background, to_sun), 0, 1) / 4
         cover = draw_people(people, w, h, share[i])
         linear = linear * (1 - cover[:, 3:]) + cover[:, :3]   # (h*w,3)
@@ -543,10 +554,12 @@ def make_toy(seed=0, size=96, photos=48, test=8, occluders=0.05, exposure=1.0, p
         gain = 2 ** (brightness / 2) * array([1 + .1 * red, 1, 1 + .1 * blue])
         srgb = clip(linear * gain, 0, 1) ** (1.2 ** contrast / 2.2)
         images.append((srgb * 255 + 0.5).astype(np.uint8).reshape(h, w, 3))
-        depth.append(trace(o, rays(K, c2w, w, h), parts)[0])
+        d = rays(*views[i])
+        t, _ = trace(o, d, parts)
+        depth.append(t)
+        surface.append(o + t[:, None] * d)
         occluder.append(cover[:, 3] > 0)
-    points, tracks = toy_points(sfm, views, depth, occluder)
-    walls = [c2w[:, 3] + rays(K, c2w, w, h) * z[:, None] for (K, c2w, w, h), z in zip(views, depth)]
+    points, tracks = toy_points(sfm, list(zip(views, surface, depth, occluder)))
     for (K, c2w, *_), held_out in zip(views, is_test):
         shake_camera(shake, K, c2w, pose_noise * (not held_out))
         c2w[:, 3] = c2w[:, 3] * TOY_SCALE + TOY_ORIGIN
@@ -559,7 +572,7 @@ def make_toy(seed=0, size=96, photos=48, test=8, occluders=0.05, exposure=1.0, p
     scene = finish(images, K, c2w, is_test, name, points, tracks, info, contain)
     scene["depth"] = (concatenate(depth) * TOY_SCALE / scene["scale"]).astype(np.float16)
     scene["occluder"] = concatenate(occluder)
-    walls = concatenate(walls)[::9] * TOY_SCALE + TOY_ORIGIN
+    walls = concatenate(surface)[::9] * TOY_SCALE + TOY_ORIGIN
     walls = (walls - scene["center"]) / scene["scale"]
     walls = walls[norm(walls, axis=1) < 0.95]
     return scene | toy_walls(scene, walls, background, landmark)
@@ -572,9 +585,7 @@ def toy_walls(scene, wall, background, landmark):
         world = x * scene["scale"] + scene["center"]
         return toy_sdf(world, background, landmark) / scene["scale"]
 
-    step = 0.004
-    ends = [sdf(wall + axis) - sdf(wall - axis) for axis in step * np.eye(3)]
-    normal = np.stack(ends, 1) / (2 * step)   # (P,3)
+    normal = gradient(sdf, wall, 0.004)
     is_smooth = abs(norm(normal, axis=1) - 1) < 0.01
     near = wall + np.random.default_rng(0).normal(0, 0.02, wall.shape)
     s = sdf(near)
@@ -642,24 +653,25 @@ def statistics(scene):
     photo's points, >= 0.02. Of the training photos: footprint, lower quartile of a pixel's size at
     points in the sphere; exposure_spread, deviation of brightness (0..1) at equal points; bg_color
     (3,), beyond the sphere; NaN unless 60 % agree."""
-    K, c2w, wh, rgb = scene["K"], scene["c2w"], scene["wh"], scene["rgb"]
+    rgb = scene["rgb"]
     step = max(1, len(rgb) // 500_000)
     near, places = [], []   # of all photos
     observed, size, bright, beyond = [], [], [], []   # of the training photos
-    for i, first in enumerate(scene["start"][:-1]):
+    photos = zip(scene["start"], scene["K"], scene["c2w"], scene["wh"])
+    for i, (first, K, c2w, wh) in enumerate(photos):
         own = scene["track_point"][scene["track_photo"] == i]
         x = scene["points"][own]
-        uv, distance = project(K[i], c2w[i], x)
-        places.append(clip(uv / wh[i], -1, 2))
+        uv, distance = project(K, c2w, x)
+        places.append(clip(uv / wh, -1, 2))
         near.append(max(0.8 * quantile(distance, 0.02), 0.02) if len(own) else 0.05)
         if scene["is_test"][i]:
             continue
-        u, v = clip(uv, 0, wh[i] - 1).astype(int).T
+        u, v = clip(uv, 0, wh - 1).astype(int).T
         observed.append(own)
-        size.append(distance[norm(x, axis=1) < 1] / K[i, 0])
-        bright.append(rgb[first + v * wh[i, 0] + u].mean(1) / 255)
-        o = c2w[i, :, 3]
-        d = rays(K[i], c2w[i], *wh[i])
+        size.append(distance[norm(x, axis=1) < 1] / K[0])
+        bright.append(rgb[first + v * wh[0] + u].mean(1) / 255)
+        o = c2w[:, 3]
+        d = rays(K, c2w, *wh)
         closest = o - minimum(d @ o, 0)[:, None] * d   # to the centre, along each ray
         misses = flatnonzero(norm(closest, axis=1) > 1)
         beyond.append(rgb[first + misses[::step]])
@@ -684,9 +696,11 @@ def statistics(scene):
 # ---- folders with photos and COLMAP models -------------------------------------------------------
 PHOTO_TYPES = ".jpg .jpeg .png .tif .tiff .bmp .webp .ppm .pgm .jp2 .avif .heic".split()
 # By COLMAP's number of a camera model: how many numbers it has; and how many focal lengths, which
-# come first, before centre and distortion.
-PARAMETERS = table("3 4 4 5 8 8 12 5 4 5 12 16 4 5 3 4 6 2").astype(int)
-FOCAL_LENGTHS = {0: 1, 1: 2, 2: 1, 3: 1, 4: 2, 6: 2}   # not of fisheye and other models
+# come first, before centre and distortion, 0 for fisheyes and other models.
+PARAMETERS, FOCAL_LENGTHS = table("""
+    3 4 4 5 8 8 12 5 4 5 12 16 4 5 3 4 6 2
+    1 2 1 1 2 0  2 0 0 0  0  0 0 0 0 0 0 0
+""").astype(int)
 
 
 def open_binary(path):
@@ -713,11 +727,10 @@ def read_photos(sparse):
         key, model, *wh = read("IiQQ")
         check(0 <= model < len(PARAMETERS),
               f"{sparse} has camera model {model}, which is unknown: run colmap image_undistorter")
-        numbers = array(read(f"{PARAMETERS[model]}d"))
-        if model in FOCAL_LENGTHS:
-            n = FOCAL_LENGTHS[model]
-            distortion = np.append(numbers[n + 2:], np.zeros(8))[:8]
-            cameras[key] = wh, numbers[[0, n - 1, n, n + 1]], distortion
+        numbers = np.append(read(f"{PARAMETERS[model]}d"), np.zeros(8))
+        n = FOCAL_LENGTHS[model]
+        if n:
+            cameras[key] = wh, numbers[[0, n - 1, n, n + 1]], numbers[n + 2:n + 10]
     read = open_binary(sparse / "images.bin")
     for _ in range(*read("Q")):
         _, *pose, camera = read("I7dI")
@@ -735,7 +748,7 @@ def check_photo(camera, pose, is_test):
     """UserError, a sentence about the photo, unless it can be used."""
     check(camera, "has no camera in the model, or a fisheye: run colmap image_undistorter")
     wh, K, distortion = camera
-    numbers = array([*K, *distortion, *pose])
+    numbers = concatenate([K, distortion, pose])
     is_sound = (abs(numbers) < FAR).all() and min(K[:2]) > 1 / FAR and pose[:4].any()
     check(is_sound and max(wh) < 32767, "has no sound camera or pose: run SfM again")
     angle = 2 * np.degrees(np.arctan(max(wh / K[:2]) / 2))
@@ -824,7 +837,7 @@ def find_model(folder, command):
 def read_table(path):
     """Lines of a table of any separator, as lists of words."""
     check(path.is_file(), f"the split file {path} is missing")
-    text = path.read_bytes().decode("utf-8-sig", "replace")
+    text = path.read_text("utf-8-sig", "replace")
     lines = [line for line in text.splitlines() if line.strip()] or [""]
     mark = max("\t;,", key=lines[0].count)
     return [[word.strip(' "') for word in line.split(mark)] for line in lines]
@@ -1043,7 +1056,7 @@ def fetch(url, path):
                 for _ in progress(range(have, total, 1 << 20), f"MiB of {path.name}"):
                     have += file.write(answer.read(1 << 20))
         check(have == total, "it ended early")
-        os.replace(part, path)
+        part.replace(path)
     except Exception as e:   # of the disk, the network or its protocol
         if getattr(e, "code", 0) == 416:   # longer than the file itself
             part.unlink()
@@ -1076,7 +1089,7 @@ def download(name):
             unpack(archive, (f"{scene}/dense/images/", f"{scene}/dense/sparse/"), temporary)
             place = Path(temporary) / scene
             shutil.copy(table, place / table.name)
-            os.replace(place, home)
+            place.replace(home)
     except Exception as e:   # a damaged archive can fail in any layer
         raise UserError(f"cannot unpack {archive} ({e}): free space, or delete it and retry") from e
 
