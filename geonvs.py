@@ -1298,7 +1298,8 @@ def report(model, path, done, state, terms):
     check(is_sound, "the loss is no longer finite: mend poses, or try a third of the learning "
           f"rates --lr_grid and --lr_net; checkpoint.pt beside {path} is from before")
     gen = torch.Generator(model.scene.c2w.device).manual_seed(0)
-    rays, _ = model.batch(model.scene.photos(False), 1024, gen)
+    count = max(1024, model.cfg.photos)
+    rays, _ = model.batch(model.scene.photos(False), count, gen)
     out = model.render(rays, model.codes()[rays.img])
     numbers = {key: float(value) for key, value in terms.items()}
     line = state | numbers | dict(psnr=psnr(out["rgb"], rays.rgb))
@@ -1707,7 +1708,8 @@ def main(argv=None):
         with device:
             model = GeoNVS(cfg, scene)
         restore(saved, path, model, torch.Generator(device))
-        film(model, scene, run / "film.mp4")
+        if RANK == 0:
+            film(model, scene, run / "film.mp4")
     else:
         execute(cfg, scene, run, saved)
     if RANKS > 1:

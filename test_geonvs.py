@@ -2627,6 +2627,12 @@ def test_a_finished_run_with_more_steps_refines_at_the_shares_to_come(scene, tmp
     assert loop.index("refine") == 2  # before step 12 of 20
 
 
+def test_a_log_line_is_written_whatever_the_number_of_photos_a_step(warm, tmp_path):
+    warm.cfg.photos = 2000
+    geonvs.report(warm, tmp_path / "log.jsonl", 0.5, dict(step=1), {})
+    assert read_log(tmp_path)[0]["psnr"] > 0
+
+
 def test_a_run_of_one_step_decides_on_the_mask(scene, tmp_path, loop):
     run_training(scene, tmp_path, steps=1)
     assert loop[-1] == "decide_mask"
