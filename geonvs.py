@@ -1091,24 +1091,17 @@ class GeoNVS(nn.Module):
 
 # ---- 8 Energy ------------------------------------------------------------------------------------
 
-def open_counter(device, rapl="/sys/class/powercap"):
-    """A function that reads joules: of a GPU, or the GPUs of all processes, through NVML (Volta and
-    newer), whatever CUDA_VISIBLE_DEVICES says, or of a CPU's packages, where readable (often by
-    root only)."""
-    if device.type == "cuda":
-        import pynvml
-        pynvml.nvmlInit()
-        gpus = []
-        for number in range(device.index, device.index + RANKS):  # this is the first process's
-            uuid = torch.cuda.get_device_properties(number).uuid
-            gpus.append(pynvml.nvmlDeviceGetHandleByUUID(f"GPU-{uuid}"))
-        return lambda: sum(map(pynvml.nvmlDeviceGetTotalEnergyConsumption, gpus)) / 1e3  # mJ
-    packages = []  # not their parts, nor the platform
-    for domain in Path(rapl).glob("intel-rapl:*"):
-        if (domain / "name").read_text().startswith("package"):
-            packages.append(domain / "energy_uj")
-    check(packages, f"no counter in {rapl}")
-    return lambda: sum(int(package.read_text()) for package in packages) / 1e6
+def open_counter(device):
+    """A function that reads joules of a GPU, or of the GPUs of all processes, through NVML (Volta
+    and newer), whatever CUDA_VISIBLE_DEVICES says."""
+    check(device.type == "cuda", "only GPUs are metered")
+    import pynvml
+    pynvml.nvmlInit()
+    gpus = []
+    for number in range(device.index, device.index + RANKS):  # this is the first process's
+        uuid = torch.cuda.get_device_properties(number).uuid
+        gpus.append(pynvml.nvmlDeviceGetHandleByUUID(f"GPU-{uuid}"))
+    return lambda: sum(map(pynvml.nvmlDeviceGetTotalEnergyConsumption, gpus)) / 1e3  # mJ
 
 
 class EnergyMeter:
