@@ -31,8 +31,8 @@ from urllib.request import Request, urlopen
 import cv2
 import numpy as np
 from numpy import arange, arctan2, array, bincount, clip, column_stack, concatenate, cross, cumsum
-from numpy import eye, flatnonzero, floor, hypot, inf, maximum, median, minimum, quantile, radians
-from numpy import repeat, reshape, sin, stack, where
+from numpy import eye, flatnonzero, float32, floor, hypot, inf, maximum, median, minimum, quantile
+from numpy import radians, repeat, reshape, sin, sqrt, stack, std, uint8, where, zeros
 from numpy.linalg import norm
 from numpy.random import default_rng
 
@@ -346,7 +346,7 @@ def enter_part(part, o, d):
     a = (flat_d ** 2).sum(1) - rise ** 2
     b = (flat_d * flat_o).sum(1) - rise * w
     c = (flat_o ** 2).sum(1) - w * w
-    root = np.sqrt(b * b - a * c)   # nan for a miss
+    root = sqrt(b * b - a * c)   # nan for a miss
     is_cone = a < 0   # such a ray is inside on one end, for ever
     enter = where(is_cone & (rise < 0), -inf, (-b - root) / a)
     leave = where(is_cone & (rise > 0), inf, (-b + root) / a)
@@ -422,8 +422,8 @@ def shade(o, d, parts, background, sun):
 def rays(K, c2w, w, h, offset=(0.5, 0.5)):
     """Unit directions through each pixel's offset, in world axes, row by row. -> (h*w,3)"""
     uv = np.indices((w, h)).T.reshape(-1, 2)
-    d = np.ones((w * h, 3))
-    d[:, :2] = (uv + offset - K[2:]) / K[:2]
+    xy = (uv + offset - K[2:]) / K[:2]
+    d = column_stack([xy, np.ones(w * h)])
     d /= lengths(d)[:, None]
     return d @ c2w[:, :3].T
 
@@ -441,8 +441,7 @@ def toy_camera(rng, azimuth, size):
     aspect = rng.choice([4 / 3, 3 / 2, 1.1, 3 / 4, 2 / 3])
     w = round(size * min(1, aspect))
     h = round(size * min(1, 1 / aspect))
-    angle = radians(rng.uniform(40, 65))   # of view, along the long side
-    f = size / 2 / np.tan(angle / 2)
+    f = size / 2 / np.tan(radians(rng.uniform(40, 65)) / 2)   # angle of view, along the long side
     target = (0, .05, .80) + rng.uniform(-.12, .12, 3)
     away = array([sin(azimuth), -np.cos(azimuth), rng.uniform(-.15, .45)])
     away = away * f / min(w, h) * rng.uniform(2.0, 2.6)
@@ -450,8 +449,7 @@ def toy_camera(rng, azimuth, size):
     place[2] = max(place[2], 0.2)
     z = target - place
     z /= norm(z)
-    lean = rng.normal(0, .03, 2)   # hardly anyone holds it level
-    x = cross(z, (*lean, 1))
+    x = cross(z, (*rng.normal(0, .03, 2), 1))   # hardly anyone holds it level
     x /= norm(x)
     c2w = stack([x, cross(z, x), z, place], 1)
     return (f, f, w / 2, h / 2), c2w, w, h
@@ -472,14 +470,14 @@ STROKES = table("""
 
 def draw_people(rng, w, h, share):
     """Passers-by on about `share` of the photo. -> (h*w,4): colour times opacity, opacity"""
-    canvas = np.zeros((4 * h, 4 * w, 4), np.float32)   # drawn large, then averaged
+    canvas = zeros((4 * h, 4 * w, 4), float32)   # drawn large, then averaged
     left = share
     while left > max(0.1 * share, 0.002):
-        tall = np.sqrt(left * w * h / .25) * rng.uniform(.5, 1)
+        tall = sqrt(left * w * h / .25) * rng.uniform(.5, 1)
         tall = 4 * clip(tall, .12 * h, .95 * h)
         feet = rng.uniform((0, 3.2 * h), (4 * w, 4 * h + .2 * tall))
         coat, legs, thing, skin = .02 + .83 * rng.beta(.4, .4, (4, 3))   # vivid, black or white
-        skin = (.3 + skin[0]) * array([.8, .6, .45])
+        skin = (.3 + skin[:1]) * (.8, .6, .45)
         stripe = thing if rng.random() < .4 else coat
         spot = rng.uniform((-.25, .5), (.25, 1.15))   # of a bag, balloon or hat
         end = spot + rng.uniform(-.15, .15, 2)
@@ -562,7 +560,7 @@ def make_toy(seed=0, size=96, photos=48, test=8, occluders=0.05, exposure=1.0, p
         brightness, red, blue, contrast = exposure * taste.uniform(-1, 1, 4)
         gain = 2 ** (brightness / 2) * array([1 + .1 * red, 1, 1 + .1 * blue])
         srgb = clip(linear * gain, 0, 1) ** (1.2 ** contrast / 2.2)
-        images.append((srgb * 255 + 0.5).astype(np.uint8).reshape(h, w, 3))
+        images.append((srgb * 255 + 0.5).astype(uint8).reshape(h, w, 3))
         d = rays(*views[i])
         t, _ = trace(o, d, parts)
         depth.append(t)
@@ -575,10 +573,10 @@ def make_toy(seed=0, size=96, photos=48, test=8, occluders=0.05, exposure=1.0, p
     building = parts[:len(LANDMARK), None]   # all of it belongs in the unit sphere
     signs = list(itertools.product((-1, 1), repeat=3))
     corners = building[..., 1:4] + building[..., [5, 7, 4]] * signs   # (P,8,3)
-    contain = corners * TOY_SCALE + TOY_ORIGIN
     K, c2w, *_ = zip(*views)
     name = [f"toy_{i:03d}.png" for i in range(count)]
-    scene = finish(images, K, c2w, is_test, name, points, tracks, info, contain)
+    scene = finish(images, K, c2w, is_test, name, points, tracks, info,
+                   contain=corners * TOY_SCALE + TOY_ORIGIN)
     scene["depth"] = (concatenate(depth) * TOY_SCALE / scene["scale"]).astype(np.float16)
     scene["occluder"] = concatenate(occluder)
     walls = concatenate(surface)[::9] * TOY_SCALE + TOY_ORIGIN
@@ -695,10 +693,10 @@ def statistics(scene):
         if agree.mean() > 0.6:
             color = typical / 255
     return scene | dict(
-        near=np.float32(near),
-        track_uv=concatenate(places, dtype=np.float32),
+        near=float32(near),
+        track_uv=concatenate(places, dtype=float32),
         footprint=quantile(concatenate(size), 0.25),
-        exposure_spread=np.std(offsets),
+        exposure_spread=std(offsets),
         bg_color=color)
 
 
@@ -736,7 +734,7 @@ def read_photos(sparse):
         key, model, *wh = read("IiQQ")
         check(0 <= model < len(PARAMETERS),
               f"{sparse} has camera model {model}, which is unknown: run colmap image_undistorter")
-        numbers = np.append(read(f"{PARAMETERS[model]}d"), np.zeros(8))
+        numbers = np.append(read(f"{PARAMETERS[model]}d"), zeros(8))
         n = FOCAL_LENGTHS[model]
         if n:
             cameras[key] = wh, numbers[[0, n - 1, n, n + 1]], numbers[n + 2:n + 10]
@@ -782,8 +780,7 @@ def read_points(sparse):
         rows[key] = len(points)
         points.append((x, y, z, error, views))
     points = array(points, float).reshape(-1, 5)
-    is_sound = (abs(points) < FAR).all(1)   # false for nan
-    points[~is_sound] = 0   # nobody sees them
+    points[~(abs(points) < FAR).all(1)] = 0   # nan as well: nobody sees them
     check((points[:, 4] > 1).any(),
           f"no point of {sparse} has a track: run colmap point_triangulator on it")
     return points, rows
@@ -892,28 +889,22 @@ def fingerprint(info):
     return checksum
 
 
-def decode(path):
-    """The photo, BGR as OpenCV has it, unturned as COLMAP has it. -> uint8 (h,w,3)"""
+def read_photo(path, camera, downscale):
+    """Unturned as COLMAP has it, undistorted, then reduced. -> rgb uint8 (h,w,3), K (4,)"""
+    (w, h), K, distortion = camera
+    check(1 <= downscale <= min(w, h) / 2, f"is {w} x {h}: choose another --downscale")
     data = path.read_bytes()
     # OpenCV says nothing where a file is cut off. A JPEG has an end mark after its last scan.
     is_cut_jpeg = data[:2] == b"\xff\xd8" and data.rfind(b"\xff\xd9") < data.rfind(b"\xff\xda")
     is_cut_png = data[1:4] == b"PNG" and b"IEND" not in data
     check(not is_cut_jpeg and not is_cut_png, "is cut off: copy it again")
-    flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
     try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+        image = cv2.imdecode(np.frombuffer(data, uint8),
+                             cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     except cv2.error:   # empty, or more than a gigapixel
         image = None
     check(image is not None,
           "is empty, damaged, too large or no photo of a known type: replace it")
-    return image
-
-
-def read_photo(path, camera, downscale):
-    """Undistorted, then reduced. -> rgb uint8 (h,w,3), K (4,)"""
-    (w, h), K, distortion = camera
-    check(1 <= downscale <= min(w, h) / 2, f"is {w} x {h}: choose another --downscale")
-    image = decode(path)
     size = image.shape[1::-1]
     check(size == (w, h),
           f"has {size[0]} x {size[1]} pixels, its camera {w} x {h}: put back what SfM saw")
@@ -951,8 +942,9 @@ def choose_parts(folder, names, split):
     return held_out
 
 
-def read_usable(model, held_out, downscale):
-    """{name: (rgb, K, c2w, ids)} of the photos that can be used; says which cannot, and why."""
+def read_usable(model, rows, held_out, downscale):
+    """{name: (rgb, K, c2w, rows of its points)} of the photos that can be used; says which cannot,
+    and why."""
     usable = {}
     for name in progress(sorted(held_out), "preparing photos"):
         try:
@@ -962,7 +954,8 @@ def read_usable(model, held_out, downscale):
             camera, pose, ids = model.photos[name]
             check_photo(camera, pose, held_out[name])
             image, K = read_photo(model.files[name], camera, downscale)
-            usable[name] = image, K, camera_to_world(pose), ids
+            own = [rows[key] for key in ids if key in rows]
+            usable[name] = image, K, camera_to_world(pose), array(own, int)
         except UserError as e:
             warn(f"left out: {name} {e}")
     lost = [name for name in held_out if held_out[name] and name not in usable]
@@ -988,27 +981,23 @@ def prepare(name, downscale=2, split=None):
     info["files"] = fingerprint(info)
     held_out = choose_parts(folder, model.names, split)
     points, rows = read_points(model.sparse)
-    usable = read_usable(model, held_out, downscale)
-    images, K, c2w, ids = zip(*usable.values())
+    usable = read_usable(model, rows, held_out, downscale)
+    images, K, c2w, tracks = zip(*usable.values())
     is_test = [held_out[name] for name in usable]
-    tracks = []
-    for own in ids:
-        own = [rows[key] for key in own if key in rows]
-        tracks.append(array(own, int))
     scene = finish(images, K, c2w, is_test, list(usable), points, tracks, info)
     uv = scene["track_uv"]
     share = (abs(uv - .5) <= .5).all(1).mean()
     says = f"only {share:.0%} of all sightings of points fall into the photo that saw them"
     photo = scene["track_photo"]
-    spread = median([np.std(uv[photo == i], axis=0).max() for i in np.unique(photo)])
+    spread = median([std(uv[photo == i], axis=0).max() for i in np.unique(photo)])
     is_sound = share >= .5 and spread > .02   # points in smaller units lie close together
     check(is_sound, f"{says}: give poses as COLMAP does, world to camera, x right, y down, "
           "z forward, in the units of the points")
     if share < .9:
         warn(says)
-    is_inside = lengths(scene["points"]) < 1
+    inside = (lengths(scene["points"]) < 1).mean()
     print(f"the sphere has a radius of {scene['scale']:.3g} units of the reconstruction; "
-          f"{is_inside.mean():.0%} of the points are inside")
+          f"{inside:.0%} of the points are inside")
     return scene
 
 
@@ -1072,11 +1061,10 @@ def fetch(folder_url, path):
 
 def unpack(archive, wanted, folder):
     """Files of a .tar.gz whose names start so; the whole archive is checked."""
-    with gzip.open(archive) as raw:
-        with tarfile.open(fileobj=raw, mode="r|") as tar:
-            for member in tar:   # files only: a link could lead outside
-                if member.isfile() and member.name.startswith(wanted):
-                    tar.extract(member, folder, filter="data")
+    with gzip.open(archive) as raw, tarfile.open(fileobj=raw, mode="r|") as tar:
+        for member in tar:   # files only: a link could lead outside
+            if member.isfile() and member.name.startswith(wanted):
+                tar.extract(member, folder, filter="data")
         while raw.read(1 << 20):   # to the checksum at the very end
             pass
 
