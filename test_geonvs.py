@@ -66,7 +66,7 @@ OCTANTS = list(itertools.product((0, 1), repeat=3))
 
 @functools.cache
 def toy(**knobs):
-    return data_prep.make_toy(**{**TINY_TOY, **knobs})
+    return data_prep.make_toy(**TINY_TOY | knobs)
 
 
 @pytest.fixture(scope="session")
@@ -101,9 +101,13 @@ def close(actual, wanted, tolerance=1e-5):
         actual, wanted, rtol=tolerance, atol=tolerance, check_dtype=False)
 
 
+def tiny(**changes):
+    return geonvs.Config(**TINY | changes)
+
+
 def make_model(scene, **changes):
     torch.manual_seed(0)
-    return geonvs.GeoNVS(geonvs.Config(**{**TINY, **changes}), scene)
+    return geonvs.GeoNVS(tiny(**changes), scene)
 
 
 @pytest.fixture(scope="session")
@@ -146,10 +150,6 @@ def gradients(model, value):
         retain_graph=True,
         materialize_grads=True)
     return dict(zip(names, grads))
-
-
-def tiny(**changes):
-    return geonvs.Config(**TINY | changes)
 
 
 def assert_close(found, wanted, atol=1e-6):
@@ -220,9 +220,9 @@ def zipped(scene, save=np.savez):
     return file.getvalue()
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def stored():
-    return data_prep.make_toy(size=16, photos=4, test=1)
+    return toy(size=16, photos=4, test=1)
 
 
 def accepts(path, data):
@@ -239,11 +239,10 @@ def accepts(path, data):
     return True
 
 
-def flipped(data, rng, low=0):
-    """The bytes, one to four bits of them flipped from place `low` on."""
+def flipped(data, rng, low):
+    """The bytes, one bit of them flipped at a place from `low` on."""
     data = bytearray(data)
-    for at in rng.integers(low, len(data), rng.integers(1, 5)):
-        data[at] ^= 1 << rng.integers(8)
+    data[rng.integers(low, len(data))] ^= 1 << rng.integers(8)
     return bytes(data)
 
 
@@ -383,9 +382,10 @@ def test_near_footprint_and_track_uv_agree_with_naive_loops():
     again = data_prep.statistics(scene)
     near = []
     sizes = []
-    for i, K in enumerate(scene["K"]):
+    for i, (K, c2w) in enumerate(zip(scene["K"], scene["c2w"])):
         points = own_points(scene, i)
-        uv, distance = data_prep.project(K, scene["c2w"][i], points)
+        distance = np.linalg.norm(points - c2w[:, 3], axis=1)
+        uv, _ = data_prep.project(K, c2w, points)
         places = again["track_uv"][scene["track_photo"] == i]
         near.append(.8 * np.quantile(distance, .02) if len(points) else .05)
         assert_close(places, np.clip(uv / scene["wh"][i], -1, 2))
@@ -427,19 +427,12 @@ def test_depth_is_where_the_distance_function_first_vanishes(knobs):
             assert (sdf(before) > -1e-3).mean() > .999
 
 
-def test_rays_go_through_the_centres_of_their_pixels_and_cameras_stand_upright():
+def test_cameras_stand_upright_and_what_is_behind_them_is_in_no_photo():
     scene = toy(pose_noise=3.0)
-    w, h = scene["wh"][1]
-    camera = scene["K"][1], scene["c2w"][1]
     o, d, _ = pixel_rays(scene, 1)
-    uv, distance = data_prep.project(*camera, o + 2.5 * d)
-    behind, _ = data_prep.project(*camera, o - d)
-    R = scene["c2w"][:, :, :3]
-    assert_close(uv, [(u + .5, v + .5) for v in range(h) for u in range(w)])
-    assert_close(distance, 2.5)
-    assert (behind < -1e8).all()
-    assert_close(np.linalg.det(R), 1)
-    assert (R[:, 2, 1] < -.5).all()   # y is down
+    uv, _ = data_prep.project(scene["K"][1], scene["c2w"][1], o - d)
+    assert (scene["c2w"][:, 2, 1] < -.5).all()   # y is down
+    assert (uv < -1e8).all()
 
 
 @pytest.mark.parametrize("shape, top, x, distance", [
@@ -456,18 +449,23 @@ def test_the_distance_to_a_part_agrees_with_its_closed_form(shape, top, x, dista
     assert_close(data_prep.part_sdf(part, np.array([x]) + move), distance)
 
 
-def test_a_wall_that_faces_the_sun_is_bright_and_ground_in_a_shadow_dark():
+def test_rays_end_on_the_part_that_they_are_said_to_hit():
+    parts = data_prep.toy_parts(0, True)
+    d = np.random.default_rng(0).uniform(-1, 1, (999, 3))
+    t, which = data_prep.trace(np.array([[0, -4.0, 1]]), d, parts)
+    hit = t < 20
+    x = [0, -4, 1] + t[hit, None] * d[hit]
+    assert len(set(which[hit])) > 9
+    assert_close(data_prep.part_sdf(parts[which[hit]], x), 0)
+
+
+def test_the_ground_behind_a_tower_is_darker_than_before_it_on_the_side_of_the_sun():
     parts = data_prep.toy_parts(0, True)
 
-    def brightness(x, y, z, *d):
-        d = np.array([d]) + 1e-6
-        return data_prep.shade(np.array([[x, y, z]]), d, parts, True, data_prep.SUN).mean()
-    front = brightness(-.5, -3, .05, 0, 1, 0)   # of the plinth; the sun is at y < 0
-    back = brightness(-.5, 3, .05, 0, -1, 0)
-    free = brightness(.1, -.75, 5, 0, 0, -1)   # ground before the tower
-    shadow = brightness(1.6, 1.1, 5, 0, 0, -1)   # and behind
-    assert front > 2 * back
-    assert shadow < .6 * free
+    def brightness(x, y):   # of the ground, from above
+        d = np.array([[1e-6, 1e-6, -1]])
+        return data_prep.shade(np.array([[x, y, 5]]), d, parts, True, data_prep.SUN).mean()
+    assert brightness(1.6, 1.1) < .6 * brightness(.1, -.75)
 
 
 def test_the_sun_turns_from_photo_to_photo_and_moves_nothing_else():
@@ -602,9 +600,9 @@ def test_points_of_three_views_and_small_errors_are_kept_if_there_are_500_of_the
 
 
 # ---- COLMAP folders ------------------------------------------------------------------------------
-@pytest.fixture(scope="module")
+@pytest.fixture
 def source():
-    return data_prep.make_toy(size=40, photos=8, test=2)
+    return toy(size=40, photos=8)
 
 
 def colmap_model(scene):
@@ -681,19 +679,17 @@ def assert_same_scene(scene, other):
 
 @pytest.mark.parametrize("images, sparse", [
     ("dense/images", "dense/sparse"), ("images", "sparse/0"), ("images", "colmap/sparse/0"),
-    ("images", "."), ("dense/0/images", "dense/0/sparse"), ("input", "distorted/sparse/0"),
-    (".", "sparse")])
+    ("images", "."), ("input", "distorted/sparse/0"), (".", "sparse")])
 def test_a_scene_survives_the_way_through_colmap_files_wherever_they_lie(
         desk, source, images, sparse):
     write_folder(desk / "place", source, images, sparse)
     scene = data_prep.prepare("place", downscale=1)
-    assert same(scene, source, "rgb", "is_test", "name", "wh", "start")
+    keys = ["rgb", "is_test", "name", "wh", "start", "track_photo", "track_point"]
+    assert same(scene, source, *keys)
     assert_close(scene["K"], source["K"])
     assert_close(scene["c2w"][..., :3], source["c2w"][..., :3])
     assert_close(world(scene, scene["c2w"][..., 3]), world(source, source["c2w"][..., 3]))
-    for i in range(10):   # each photo sees the same points of the world
-        mine, theirs = (world(s, own_points(s, i)).round(4) for s in (scene, source))
-        assert np.isin(theirs, mine).mean() > .9
+    assert_close(world(scene, scene["points"]), world(source, source["points"]), atol=1e-4)
 
 
 def test_photos_shrink_as_a_mean_and_their_cameras_with_them(model, source):
@@ -806,8 +802,7 @@ def test_an_unusable_model_gives_a_sentence_and_exit_code_2_and_writes_nothing(m
 @pytest.mark.parametrize("path, says", [
     (IMAGES, "such as ['toy_000.png']: put them into place/images"),
     (SPARSE, "run python data_prep.py place --sfm, or for a text model colmap model_converter"),
-    (SPARSE / "cameras.bin", "cameras.bin is missing"),
-    (SPARSE / "points3D.bin", "run colmap point_triangulator")])
+    (SPARSE / "points3D.bin", "points3D.bin is missing: copy the whole model, or for points run")])
 def test_what_is_missing_is_said(model, path, says):
     path.rename("elsewhere")
     assert_error("place", says)
@@ -836,8 +831,7 @@ def jpeg(h, w):
     ("numbers", (30, 1e-300, 2, 1), "no sound camera or pose"),
     ("numbers", (30, 30, np.inf, 1), "no sound camera or pose"),
     ("camera", 12345, "no camera in the model"),
-    ("file", lambda data: b"", "is empty"),
-    ("file", lambda data: b"x", "no photo"),
+    ("file", lambda data: b"", "is empty, damaged, too large or no photo"),
     ("file", lambda data: data[:-20], "is cut off"),
     ("file", lambda data: jpeg(27, 40)[:-20], "is cut off"),
     ("file", lambda data: jpeg(7, 9), "has 9 x 7 pixels, its camera 40 x 27")])
@@ -891,8 +885,6 @@ def test_photos_are_found_by_names_with_folders_behind_links_and_as_windows_wrot
 
 
 def test_of_equal_models_one_that_can_be_used_is_taken_without_a_word(model):
-    shutil.copytree(IMAGES, "place/raw/images")
-    write_model(Path("place/raw/sparse"), model)
     for_all("images", camera=99)(model)
     write_model(Path("place/models"), model)
     code, out, err = run_main("place")
@@ -968,14 +960,14 @@ def held_out(*argv):
 @pytest.mark.parametrize("name", ["nerfw_split.csv", "s.tsv"])
 def test_the_table_of_a_folder_is_used_and_named(model, name):
     TABLE.unlink()
-    rows = [f"toy_00{i}.png;{'test' if i == 5 else 'train'}" for i in range(9)]
-    Path("place", name).write_text("filename;split\n" + "\n".join(rows))
+    text = "filename;split\ntoy_000.png;train\ntoy_003.png;train\ntoy_005.png;test"
+    Path("place", name).write_text(text)
     Path("place/other.csv").write_text("a,b\n1,2\n")
     Path("place/._s.tsv").write_text("filename\tsplit\n")   # as a Mac leaves on other disks
     names, out, err = held_out()
     assert names == ["toy_005.png"]
     assert f"split by place/{name}" in out
-    assert "1 photos are not in" in err
+    assert "7 photos are not in" in err
 
 
 @pytest.mark.parametrize("given", [[], ["--split", "place/test_list.txt"]])
@@ -1036,13 +1028,12 @@ def test_a_scene_is_made_once_for_each_size_and_does_without_its_sources(model, 
 
 
 @pytest.mark.parametrize("path", [PHOTO, SPARSE / "images.bin", SPARSE / "points3D.bin", TABLE])
-def test_a_scene_is_made_anew_when_a_source_is_older_newer_or_larger(model, capsys, path):
+def test_a_scene_is_made_anew_when_a_source_is_older_or_larger(model, capsys, path):
     makes(capsys)
-    for seconds in (1000, 4 * 10 ** 9):
-        os.utime(path, (seconds, seconds))
-        assert makes(capsys)
+    os.utime(path, (1000, 1000))
+    assert makes(capsys)
     path.write_bytes(path.read_bytes() + b"\n")
-    os.utime(path, (seconds, seconds))
+    os.utime(path, (1000, 1000))
     assert makes(capsys)
 
 
@@ -1058,16 +1049,15 @@ def test_a_scene_is_made_anew_when_a_photo_or_a_model_goes_or_comes(model, capsy
 
 def test_a_split_named_once_stays_when_the_scene_is_made_again(model, capsys):
     table = Path("mine.tsv")   # not the folder's own
-    rows = [f"toy_00{i}.png\t{'test' if i == 3 else 'train'}" for i in range(10)]
-    table.write_text("filename\tsplit\n" + "\n".join(rows))
+    table.write_text("filename\tsplit\ntoy_000.png\ttrain\ntoy_001.png\ttrain\ntoy_003.png\ttest")
     assert held_out("--split", "mine.tsv")[0] == ["toy_003.png"]
     os.utime(table, (1000, 1000))
-    assert makes(capsys, downscale=1)
-    scene = data_prep.open_scene("place", 1)
+    assert makes(capsys)
+    scene = data_prep.open_scene("place")
     assert scene["name"][scene["is_test"]].tolist() == ["toy_003.png"]
     table.unlink()
     with pytest.raises(UserError, match="mine.tsv is missing"):
-        data_prep.open_scene("place", 4)
+        data_prep.open_scene("place")
 
 
 def test_every_folder_has_a_file_of_its_own(desk):
@@ -1119,16 +1109,10 @@ def damaged(tmp_path, source, request):
     return path.name, path.read_bytes(), functools.partial(survives, read)
 
 
-def test_truncated_models_are_refused_wherever_they_end(damaged):
-    name, data, read = damaged
-    assert read(data)
-    for n in range(0, len(data), 31):
-        assert read(data[:n]) is None
-
-
 def test_promised_counts_are_noticed_before_memory_is_taken(damaged):
     name, data, read = damaged
     inner = {"cameras.bin": 0, "images.bin": data.find(b"png\0") + 4, "points3D.bin": 51}
+    assert read(data)
     for at in (0, inner[name]):
         for count in (1000, 2 ** 40, 2 ** 64 - 1):
             result, size = peak(read, data[:at] + pack("Q", count) + data[at + 8:])
@@ -1219,12 +1203,6 @@ def test_a_whole_part_is_used_and_a_longer_one_started_over(server):
     assert unpacked() == WANTED
 
 
-@pytest.mark.parametrize("name, says", [("sacre", "404"), ("nowhere", "--download knows")])
-def test_what_fails_of_a_download_is_said(server, name, says):
-    with pytest.raises(UserError, match=says):
-        data_prep.download(name)
-
-
 @pytest.mark.parametrize("evil", [
     (DENSE + "images/../../../../evil.txt", b"x"), (DENSE + "images/link", "/etc"),
     (DENSE + "images/link", "../../../.."), ("brandenburg_gate/dense/images", "/tmp")])
@@ -1261,7 +1239,7 @@ def test_the_command_line_makes_a_toy_with_any_knob(desk):
 
 @pytest.mark.parametrize("argv", [
     "toy --sizee 9", "toy --siz 32", "toy --size x", "", "nowhere", "brandenburg", "x --download",
-    "toy --occluders 2", "place --downscale 0", "place --downscale 16", "toy --pose_noise nan",
+    "toy --occluders .61", "place --downscale 0", "place --downscale 16", "toy --pose_noise nan",
     "toy --pose_noise inf", "toy --downscale 4", "toy --split x.tsv", "place --split x.tsv",
     "toy --exposure -1", "toy --exposure 2.1", "toy --seed -1", "place --size 9", "toy --size 15",
     "toy --photos 3", "toy --test -1", "toy --pose_noise -1", "toy --landmark -1", "toy --sun 181",
