@@ -23,7 +23,6 @@ import subprocess
 import sys
 import tarfile
 import tracemalloc
-import zipfile
 from dataclasses import asdict, fields, replace
 from pathlib import Path
 from types import SimpleNamespace
