@@ -354,6 +354,8 @@ def test_every_landmark_is_another_building_that_stands_in_the_unit_sphere(numbe
         foot = np.array([[x, y, z - half]])
         others = [data_prep.part_sdf(other, foot) for other in np.delete(parts, i, 0)]
         assert z - half < 1e-9 or min(others) < .02
+    first = [2, 16, 19, 21]   # of a column, the tower, the annex and the statue
+    assert_close(np.subtract(*parts[first, 3:5].T), np.subtract(*data_prep.LANDMARK[first, 3:5].T))
     scene = toy(landmark=number)
     rng = np.random.default_rng(0)
     x = rng.uniform(-1.5, 1.5, (60_000, 3))   # in scene units
@@ -446,6 +448,18 @@ def test_the_distance_to_a_part_agrees_with_its_closed_form(shape, top, x, dista
     part = np.array([shape, 0, 0, 0, 1, 3, top, 2, 0])   # 1 half high, 3 wide below, 2 deep
     part[1:4] = move = shape * np.array([10, 20, 30])
     assert_close(data_prep.part_sdf(part, np.array([x]) + move), distance)
+
+
+def test_walls_and_points_near_them_agree_with_the_distance_function():
+    scene = toy()
+
+    def sdf(x):
+        return data_prep.toy_sdf(world(scene, x)) / scene["scale"]
+    before = sdf(scene["wall"] + .004 * scene["wall_normal"])
+    assert len(before) > 100
+    assert_close(np.median(before), .004, atol=1e-4)
+    assert_close(sdf(scene["near_wall"]), scene["near_wall_sdf"])
+    assert np.abs(scene["near_wall_sdf"]).max() < .05
 
 
 def test_rays_end_on_the_part_that_they_are_said_to_hit():
