@@ -30,9 +30,11 @@ from urllib.request import Request, urlopen
 
 import cv2
 import numpy as np
-from numpy import arange, array, bincount, clip, concatenate, cross, eye, flatnonzero, floor, hypot
-from numpy import inf, maximum, median, minimum, quantile, radians, sin, stack, where
+from numpy import arange, arctan2, array, bincount, clip, column_stack, concatenate, cross, cumsum
+from numpy import eye, flatnonzero, float32, floor, hypot, inf, maximum, median, minimum, quantile
+from numpy import radians, repeat, reshape, sin, sqrt, stack, std, uint8, where, zeros
 from numpy.linalg import norm
+from numpy.random import default_rng
 
 # name: (archive, split file)
 SCENES = {
@@ -130,11 +132,13 @@ def refuse_bomb(path):
 
 def check_scene(scene):
     """UserError unless the arrays fit FORMAT and each other."""
-    start, wh = scene["start"], scene["wh"]
-    photos, points = len(wh), len(scene["points"])
+    start = scene["start"]
+    wh = scene["wh"]
+    photos = len(wh)
+    points = len(scene["points"])
     tracks = scene["track_photo"], scene["track_point"]
-    sizes = {"2": 2, "3": 3, "4": 4, "I": photos, "J": photos + 1, "K": points}
-    sizes.update(N=start[-1], T=len(tracks[0]))
+    sizes = {"2": 2, "3": 3, "4": 4, "I": photos, "J": photos + 1, "K": points, "N": start[-1],
+             "T": len(tracks[0])}
     for key, text in FORMAT.items():
         value = scene[key]
         dtype, _, letters = text.partition(" ")
@@ -143,7 +147,7 @@ def check_scene(scene):
         if dtype.startswith("float") and key != "bg_color":
             check(np.isfinite(value).all(), key)
     np.ravel_multi_index(tracks, (photos, points))   # ValueError if any is out of range
-    check(wh.min() > 0 and np.array_equal(start, np.cumsum([0, *wh.prod(1)])), "start")
+    check(wh.min() > 0 and np.array_equal(start, cumsum([0, *wh.prod(1)])), "start")
     check(min(scene["footprint"], scene["scale"]) > 0 and not scene["is_test"].all(), "scale")
     info = json.loads(str(scene["info"]))
     check({"kind", "scene", "downscale", "folder", "split"} <= set(info), "info")
@@ -166,7 +170,11 @@ TOY_SCALE = 3.7
 TOY_ORIGIN = 12.0, -7.0, 5.0
 SUN = array([-.50, -.62, .60])   # left, behind the tourists
 SUN /= norm(SUN)
-STONE, PALE, SAND, BRICK, ROOF, SLATE, COPPER, GOLD, HOUSE, LEAF, PAVING, MEADOW = range(12)
+
+
+def lengths(x):
+    """Of vectors (P,3) -> (P,)"""
+    return norm(x, axis=1)
 
 
 def table(text):
@@ -174,21 +182,22 @@ def table(text):
     return np.loadtxt(io.StringIO(text))
 
 
-# Colour, width and height of a cell, contrast of cells, has windows; a row a surface.
+# Colour, width and height of a cell, contrast of cells, has windows.
 MATERIALS = table("""
-     .5  .46   .4  .29  .13   .2  0
-     .8  .74   .6  .29  .13  .08  0
-    .78  .56   .3   .3   .3  .15  1
-    .52  .19  .11   .3   .3  .15  1
-     .6  .22  .12  .16  .08   .3  0
-    .12  .19  .31   .2   .1  .25  0
-    .16  .46  .36   .5   .5   .4  0
-     .9  .58  .08   .5   .5    0  0
-     .6  .46  .34  .62  .62  .15  1
-     .1  .22  .05   .2   .2  .45  0
-    .48  .42  .34  .42  .42   .2  0
-    .17  .22  .08   .6   .6   .1  0
+     .5  .46   .4  .29  .13   .2  0   # 0 stone
+     .8  .74   .6  .29  .13  .08  0   # 1 pale
+    .78  .56   .3   .3   .3  .15  1   # 2 sand
+    .52  .19  .11   .3   .3  .15  1   # 3 brick
+     .6  .22  .12  .16  .08   .3  0   # 4 roof
+    .12  .19  .31   .2   .1  .25  0   # 5 slate
+    .16  .46  .36   .5   .5   .4  0   # 6 copper
+     .9  .58  .08   .5   .5    0  0   # 7 gold
+     .6  .46  .34  .62  .62  .15  1   # 8 house
+     .1  .22  .05   .2   .2  .45  0   # 9 leaf
+    .48  .42  .34  .42  .42   .2  0   # 10 paving
+    .17  .22  .08   .6   .6   .1  0   # 11 meadow
 """)
+SAND, ROOF, GOLD, MEADOW = 2, 4, 7, 11
 # Shape; centre x y z, half height, radius at the bottom and at the top, depth; material.
 # Shape 1 is a box or roof, |x| <= radius and |y| <= depth; 2 a column or cone; 3 a ball; 0 the
 # ground, z < 0. Plinth, columns, hall; dome; tower; annex; statue.
@@ -265,7 +274,7 @@ def toy_parts(landmark, background):
     """(P,9): LANDMARK, for other numbers than 0 another building of such parts; maybe a town."""
     parts = LANDMARK.copy()
     if landmark:
-        rng = np.random.default_rng([landmark, 1])
+        rng = default_rng([landmark, 1])
         for first, last in GROUPS:   # stretch and move
             group = parts[first:last]
             place = group[:, 1:4]
@@ -288,7 +297,7 @@ def toy_parts(landmark, background):
 
 def part_sdf(part, x):
     """Distance to one part (9,), or to one part for each point (P,9). x (P,3) -> (P,)"""
-    shape, _, _, _, half, bottom, top, depth, _ = part.T
+    shape, *_, half, bottom, top, depth, _ = part.T
     x, y, z = (x - part[..., 1:4]).T
     u = where(shape == 1, abs(x), hypot(x, y))
     # In the plane of u and z: from the slanted side, which goes from bottom to top, and the caps.
@@ -337,7 +346,7 @@ def enter_part(part, o, d):
     a = (flat_d ** 2).sum(1) - rise ** 2
     b = (flat_d * flat_o).sum(1) - rise * w
     c = (flat_o ** 2).sum(1) - w * w
-    root = np.sqrt(b * b - a * c)   # nan for a miss
+    root = sqrt(b * b - a * c)   # nan for a miss
     is_cone = a < 0   # such a ray is inside on one end, for ever
     enter = where(is_cone & (rise < 0), -inf, (-b - root) / a)
     leave = where(is_cone & (rise > 0), inf, (-b + root) / a)
@@ -367,7 +376,7 @@ HILLS = table("""
 def sky(d):
     """Radiance of the sky and two ranges of hills. d (R,3) -> (R,3) linear"""
     up = d[:, 2:]
-    azimuth = np.arctan2(d[:, :1], d[:, 1:2])
+    azimuth = arctan2(d[:, :1], d[:, 1:2])
     colour = (.58, .68, .78) - clip(up * 1.5, 0, 1) * (.52, .46, .26)
     for base, size, waves, *hill in HILLS:
         ridge = sin(waves * azimuth + base * 40) + 0.6 * sin(2.3 * waves * azimuth)
@@ -383,7 +392,7 @@ def paint(x, part):
     is_meadow = is_ground & (hypot(x, y) >= 2.6)
     material = MATERIALS[where(is_meadow, MEADOW, part[:, 8]).astype(int)]
     width, height, contrast, windows = material.T[3:]
-    turn = np.arctan2(y - centre_y, x - centre_x)
+    turn = arctan2(y - centre_y, x - centre_x)
     across = where(is_ground, x, where(shape == 1, x + y, turn))
     row = where(is_ground, y, z) / height
     bond = floor(row) % 2 / 2 * (1 - windows)   # every other row of stones is shifted
@@ -398,7 +407,7 @@ def shade(o, d, parts, background, sun):
     """Radiance along rays: sun, shadow, sky light and haze. o (1,3), d (R,3), sun (3,) -> (R,3)"""
     colour = sky(d) * background
     t, which = trace(o, d, parts)
-    hit = flatnonzero(t < inf)
+    hit = t < inf
     x = o + t[hit, None] * d[hit]
     part = parts[which[hit]]   # (H,9)
     normal = gradient(lambda x: part_sdf(part, x), x, 1e-5)
@@ -412,10 +421,10 @@ def shade(o, d, parts, background, sun):
 
 def rays(K, c2w, w, h, offset=(0.5, 0.5)):
     """Unit directions through each pixel's offset, in world axes, row by row. -> (h*w,3)"""
-    v, u = np.mgrid[:h, :w].reshape(2, -1)
-    d = np.ones((w * h, 3))
-    d[:, :2] = (stack([u, v], 1) + offset - K[2:]) / K[:2]
-    d /= norm(d, axis=1, keepdims=True)
+    uv = np.indices((w, h)).T.reshape(-1, 2)
+    xy = (uv + offset - K[2:]) / K[:2]
+    d = column_stack([xy, np.ones(w * h)])
+    d /= lengths(d)[:, None]
     return d @ c2w[:, :3].T
 
 
@@ -424,7 +433,7 @@ def project(K, c2w, x):
     p = (x - c2w[:, 3]) @ c2w[:, :3]
     z = p[:, 2:]
     uv = p[:, :2] / maximum(z, 1 / FAR) * K[:2] + K[2:]
-    return where(z > 0, uv, -1e9), norm(p, axis=1)
+    return where(z > 0, uv, -1e9), lengths(p)
 
 
 def toy_camera(rng, azimuth, size):
@@ -432,8 +441,7 @@ def toy_camera(rng, azimuth, size):
     aspect = rng.choice([4 / 3, 3 / 2, 1.1, 3 / 4, 2 / 3])
     w = round(size * min(1, aspect))
     h = round(size * min(1, 1 / aspect))
-    angle = radians(rng.uniform(40, 65))   # of view, along the long side
-    f = size / 2 / np.tan(angle / 2)
+    f = size / 2 / np.tan(radians(rng.uniform(40, 65)) / 2)   # angle of view, along the long side
     target = (0, .05, .80) + rng.uniform(-.12, .12, 3)
     away = array([sin(azimuth), -np.cos(azimuth), rng.uniform(-.15, .45)])
     away = away * f / min(w, h) * rng.uniform(2.0, 2.6)
@@ -441,11 +449,10 @@ def toy_camera(rng, azimuth, size):
     place[2] = max(place[2], 0.2)
     z = target - place
     z /= norm(z)
-    lean = rng.normal(0, .03, 2)   # hardly anyone holds it level
-    x = cross(z, (*lean, 1))
+    x = cross(z, (*rng.normal(0, .03, 2), 1))   # hardly anyone holds it level
     x /= norm(x)
     c2w = stack([x, cross(z, x), z, place], 1)
-    return array([f, f, w / 2, h / 2]), c2w, w, h
+    return (f, f, w / 2, h / 2), c2w, w, h
 
 
 # Legs, belts of the coat and head: both ends x y and width, in heights above the feet.
@@ -463,21 +470,21 @@ STROKES = table("""
 
 def draw_people(rng, w, h, share):
     """Passers-by on about `share` of the photo. -> (h*w,4): colour times opacity, opacity"""
-    canvas = np.zeros((4 * h, 4 * w, 4), np.float32)   # drawn large, then averaged
+    canvas = zeros((4 * h, 4 * w, 4), float32)   # drawn large, then averaged
     left = share
     while left > max(0.1 * share, 0.002):
-        tall = np.sqrt(left * w * h / .25) * rng.uniform(.5, 1)
+        tall = sqrt(left * w * h / .25) * rng.uniform(.5, 1)
         tall = 4 * clip(tall, .12 * h, .95 * h)
         feet = rng.uniform((0, 3.2 * h), (4 * w, 4 * h + .2 * tall))
         coat, legs, thing, skin = .02 + .83 * rng.beta(.4, .4, (4, 3))   # vivid, black or white
-        skin = (.3 + skin[0]) * array([.8, .6, .45])
+        skin = (.3 + skin[:1]) * (.8, .6, .45)
         stripe = thing if rng.random() < .4 else coat
         spot = rng.uniform((-.25, .5), (.25, 1.15))   # of a bag, balloon or hat
         end = spot + rng.uniform(-.15, .15, 2)
         strokes = [*STROKES, (*spot, *end, rng.uniform(.08, .25))]
         colours = legs, legs, coat, stripe, coat, stripe, coat, skin, thing
         for colour, (*ends, wide) in zip(colours, strokes):
-            ends = feet + np.reshape(ends, (2, 2)) * (tall, -tall)
+            ends = feet + reshape(ends, (2, 2)) * (tall, -tall)
             thickness = int(wide * tall) + 1
             cv2.line(canvas, *ends.astype(int).tolist(), (*colour.tolist(), 1), thickness)
         left = share - canvas[..., 3].mean()
@@ -507,7 +514,7 @@ def toy_points(rng, photos):
     x += is_wrong * rng.uniform(-1, 1, x.shape)
     x = (x + rng.normal(0, .005, x.shape)) * TOY_SCALE + TOY_ORIGIN
     counts = bincount(concatenate(tracks), minlength=len(x))
-    return np.column_stack([x, 0 * counts, counts]), tracks
+    return column_stack([x, 0 * counts, counts]), tracks
 
 
 def shake_camera(rng, K, c2w, pixels):
@@ -530,7 +537,7 @@ def make_toy(seed=0, size=96, photos=48, test=8, occluders=0.05, exposure=1.0, p
     check(is_sound and size >= 16 and photos >= 4,
           "occluders in 0..0.6, exposure 0..2, sun 0..180, size >= 16, photos >= 4, others >= 0")
     # No knob changes another's random numbers.
-    camera, taste, people, sfm, shake, day = [np.random.default_rng([seed, k]) for k in range(6)]
+    camera, taste, people, sfm, shake, day = [default_rng([seed, k]) for k in range(6)]
     count = photos + test
     angles = 200 * (arange(count) + camera.uniform(.1, .9, count)) / count - 100
     views = [toy_camera(camera, angle, size) for angle in radians(angles)]
@@ -553,7 +560,7 @@ def make_toy(seed=0, size=96, photos=48, test=8, occluders=0.05, exposure=1.0, p
         brightness, red, blue, contrast = exposure * taste.uniform(-1, 1, 4)
         gain = 2 ** (brightness / 2) * array([1 + .1 * red, 1, 1 + .1 * blue])
         srgb = clip(linear * gain, 0, 1) ** (1.2 ** contrast / 2.2)
-        images.append((srgb * 255 + 0.5).astype(np.uint8).reshape(h, w, 3))
+        images.append((srgb * 255 + 0.5).astype(uint8).reshape(h, w, 3))
         d = rays(*views[i])
         t, _ = trace(o, d, parts)
         depth.append(t)
@@ -566,15 +573,15 @@ def make_toy(seed=0, size=96, photos=48, test=8, occluders=0.05, exposure=1.0, p
     building = parts[:len(LANDMARK), None]   # all of it belongs in the unit sphere
     signs = list(itertools.product((-1, 1), repeat=3))
     corners = building[..., 1:4] + building[..., [5, 7, 4]] * signs   # (P,8,3)
-    contain = corners * TOY_SCALE + TOY_ORIGIN
     K, c2w, *_ = zip(*views)
     name = [f"toy_{i:03d}.png" for i in range(count)]
-    scene = finish(images, K, c2w, is_test, name, points, tracks, info, contain)
+    scene = finish(images, K, c2w, is_test, name, points, tracks, info,
+                   contain=corners * TOY_SCALE + TOY_ORIGIN)
     scene["depth"] = (concatenate(depth) * TOY_SCALE / scene["scale"]).astype(np.float16)
     scene["occluder"] = concatenate(occluder)
     walls = concatenate(surface)[::9] * TOY_SCALE + TOY_ORIGIN
     walls = (walls - scene["center"]) / scene["scale"]
-    walls = walls[norm(walls, axis=1) < 0.95]
+    walls = walls[lengths(walls) < 0.95]
     return scene | toy_walls(scene, walls, background, landmark)
 
 
@@ -586,8 +593,8 @@ def toy_walls(scene, wall, background, landmark):
         return toy_sdf(world, background, landmark) / scene["scale"]
 
     normal = gradient(sdf, wall, 0.004)
-    is_smooth = abs(norm(normal, axis=1) - 1) < 0.01
-    near = wall + np.random.default_rng(0).normal(0, 0.02, wall.shape)
+    is_smooth = abs(lengths(normal) - 1) < 0.01
+    near = wall + default_rng(0).normal(0, 0.02, wall.shape)
     s = sdf(near)
     is_near = abs(s) < 0.05
     return dict(wall=wall[is_smooth], wall_normal=normal[is_smooth], near_wall=near[is_near],
@@ -603,10 +610,10 @@ def find_sphere(x, weight, tracks, is_test, contain):
     Inside are at least 30 % of the points (M,) of most training photos, and contain (...,3)."""
     centre = median(x, axis=0)
     for _ in range(20):   # Weiszfeld
-        w = weight / maximum(norm(x - centre, axis=1), 1e-9)
+        w = weight / maximum(lengths(x - centre), 1e-9)
         centre = w @ x / w.sum()
-    distance = norm(x - centre, axis=1)   # (K,)
-    counted = np.repeat(distance, weight)
+    distance = lengths(x - centre)   # (K,)
+    counted = repeat(distance, weight)
     limit = 4 * median(counted)
     if quantile(counted, 0.95) > limit:
         counted = counted[counted <= limit]
@@ -614,7 +621,7 @@ def find_sphere(x, weight, tracks, is_test, contain):
     reach = [quantile(distance[own], 0.3)
              for own, held_out in zip(tracks, is_test) if len(own) and not held_out]
     check(reach, "no training photo observes a usable 3D point: they do not belong together")
-    corners = norm(np.reshape(contain, (-1, 3)) - centre, axis=1)
+    corners = lengths(reshape(contain, (-1, 3)) - centre)
     radius = max(radius, median(reach), *1.02 * corners)
     check(radius > 1 / FAR, "all 3D points coincide: run SfM again")
     return centre, radius
@@ -629,7 +636,7 @@ def finish(images, K, c2w, is_test, name, points, tracks, info, contain=()):
         usable = views >= 2
     check(usable.sum() >= 20, f"{usable.sum()} usable 3D points: SfM needs more overlapping photos")
     usable &= error <= quantile(error[usable], 0.95)
-    new_index = np.cumsum(usable) - 1
+    new_index = cumsum(usable) - 1
     tracks = [new_index[own[usable[own]]] for own in tracks]
     x = points[usable, :3]
     weight = minimum(views[usable], 20).astype(int)
@@ -639,10 +646,10 @@ def finish(images, K, c2w, is_test, name, points, tracks, info, contain=()):
     wh = array([image.shape[1::-1] for image in images])
     arrays = dict(
         rgb=concatenate([image.reshape(-1, 3) for image in images]),
-        start=np.cumsum([0, *wh.prod(1)]),
+        start=cumsum([0, *wh.prod(1)]),
         wh=wh, K=K, c2w=c2w, is_test=is_test, name=name, info=json.dumps(info),
         points=(x - centre) / radius, center=centre, scale=radius,
-        track_photo=np.repeat(arange(len(wh)), list(map(len, tracks))),
+        track_photo=repeat(arange(len(wh)), list(map(len, tracks))),
         track_point=concatenate(tracks))
     scene = {key: np.asarray(value, FORMAT[key].split()[0]) for key, value in arrays.items()}
     return statistics(scene)
@@ -666,14 +673,14 @@ def statistics(scene):
         near.append(max(0.8 * quantile(distance, 0.02), 0.02) if len(own) else 0.05)
         if scene["is_test"][i]:
             continue
-        u, v = clip(uv, 0, wh - 1).astype(int).T
+        at = clip(uv, 0, wh - 1).astype(int) @ (1, wh[0])
         observed.append(own)
-        size.append(distance[norm(x, axis=1) < 1] / K[0])
-        bright.append(rgb[first + v * wh[0] + u].mean(1) / 255)
+        size.append(distance[lengths(x) < 1] / K[0])
+        bright.append(rgb[first + at].mean(1) / 255)
         o = c2w[:, 3]
         d = rays(K, c2w, *wh)
         closest = o - minimum(d @ o, 0)[:, None] * d   # to the centre, along each ray
-        misses = flatnonzero(norm(closest, axis=1) > 1)
+        misses = flatnonzero(lengths(closest) > 1)
         beyond.append(rgb[first + misses[::step]])
     every = concatenate(observed)
     mean = bincount(every, concatenate(bright)) / maximum(bincount(every), 1)   # (K,)
@@ -686,10 +693,10 @@ def statistics(scene):
         if agree.mean() > 0.6:
             color = typical / 255
     return scene | dict(
-        near=np.float32(near),
-        track_uv=concatenate(places, dtype=np.float32),
+        near=float32(near),
+        track_uv=concatenate(places, dtype=float32),
         footprint=quantile(concatenate(size), 0.25),
-        exposure_spread=np.std(offsets),
+        exposure_spread=std(offsets),
         bg_color=color)
 
 
@@ -727,7 +734,7 @@ def read_photos(sparse):
         key, model, *wh = read("IiQQ")
         check(0 <= model < len(PARAMETERS),
               f"{sparse} has camera model {model}, which is unknown: run colmap image_undistorter")
-        numbers = np.append(read(f"{PARAMETERS[model]}d"), np.zeros(8))
+        numbers = np.append(read(f"{PARAMETERS[model]}d"), zeros(8))
         n = FOCAL_LENGTHS[model]
         if n:
             cameras[key] = wh, numbers[[0, n - 1, n, n + 1]], numbers[n + 2:n + 10]
@@ -760,7 +767,7 @@ def camera_to_world(pose):
     w, *v = pose[:4] / norm(pose[:4])   # old files are not normalised
     turn = cross(v, eye(3))
     R = eye(3) + 2 * w * turn + 2 * turn @ turn
-    return np.column_stack([R, -R @ pose[4:]])
+    return column_stack([R, -R @ pose[4:]])
 
 
 def read_points(sparse):
@@ -773,8 +780,7 @@ def read_points(sparse):
         rows[key] = len(points)
         points.append((x, y, z, error, views))
     points = array(points, float).reshape(-1, 5)
-    is_sound = (abs(points) < FAR).all(1)   # false for nan
-    points[~is_sound] = 0   # nobody sees them
+    points[~(abs(points) < FAR).all(1)] = 0   # nan as well: nobody sees them
     check((points[:, 4] > 1).any(),
           f"no point of {sparse} has a track: run colmap point_triangulator on it")
     return points, rows
@@ -867,16 +873,6 @@ def read_split(path):
     return held_out
 
 
-def find_split(folder):
-    """The split file of a folder, or one of its two lists, or None."""
-    tables = sorted(folder.glob("[!.]*.[ct]sv"))
-    tables = [path for path in tables if "split" in read_table(path)[0]]
-    if not tables:
-        tables = list(folder.glob("train*.txt"))
-    check(len(tables) < 2, f"choose a split file by --split: {', '.join(map(str, tables))}")
-    return tables[0] if tables else None
-
-
 def fingerprint(info):
     """Of names, sizes and times of all files that a scene is read from."""
     folder = Path(info["folder"])
@@ -893,28 +889,22 @@ def fingerprint(info):
     return checksum
 
 
-def decode(path):
-    """The photo, BGR as OpenCV has it, unturned as COLMAP has it. -> uint8 (h,w,3)"""
+def read_photo(path, camera, downscale):
+    """Unturned as COLMAP has it, undistorted, then reduced. -> rgb uint8 (h,w,3), K (4,)"""
+    (w, h), K, distortion = camera
+    check(1 <= downscale <= min(w, h) / 2, f"is {w} x {h}: choose another --downscale")
     data = path.read_bytes()
     # OpenCV says nothing where a file is cut off. A JPEG has an end mark after its last scan.
     is_cut_jpeg = data[:2] == b"\xff\xd8" and data.rfind(b"\xff\xd9") < data.rfind(b"\xff\xda")
     is_cut_png = data[1:4] == b"PNG" and b"IEND" not in data
     check(not is_cut_jpeg and not is_cut_png, "is cut off: copy it again")
-    flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
     try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+        image = cv2.imdecode(np.frombuffer(data, uint8),
+                             cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     except cv2.error:   # empty, or more than a gigapixel
         image = None
     check(image is not None,
           "is empty, damaged, too large or no photo of a known type: replace it")
-    return image
-
-
-def read_photo(path, camera, downscale):
-    """Undistorted, then reduced. -> rgb uint8 (h,w,3), K (4,)"""
-    (w, h), K, distortion = camera
-    check(1 <= downscale <= min(w, h) / 2, f"is {w} x {h}: choose another --downscale")
-    image = decode(path)
     size = image.shape[1::-1]
     check(size == (w, h),
           f"has {size[0]} x {size[1]} pixels, its camera {w} x {h}: put back what SfM saw")
@@ -931,22 +921,30 @@ def read_photo(path, camera, downscale):
     return image[..., ::-1], K * (small * 2) / (w, h, w, h)
 
 
-def choose_parts(folder, model, split):
-    """{name: whether it is held out} of the photos that are to be used; says by which rule."""
-    table = Path(split) if split else find_split(folder)
-    if table is None:
+def choose_parts(folder, names, split):
+    """{name: whether it is held out} of the photos that are to be used, by the split file named or
+    found in the folder, which may be one of two lists; says by which rule."""
+    tables = sorted(folder.glob("[!.]*.[ct]sv"))
+    tables = [path for path in tables if "split" in read_table(path)[0]]
+    if not tables:
+        tables = list(folder.glob("train*.txt"))
+    if split:
+        tables = [Path(split)]
+    check(len(tables) < 2, f"choose a split file by --split: {', '.join(map(str, tables))}")
+    if not tables:
         print(f"{folder} has no split file: every eighth photo is held out")
-        return {name: i % 8 == 7 for i, name in enumerate(model.names)}
-    held_out = read_split(table)
-    print(f"split by {table}")
-    rest = set(model.names) - held_out.keys()
+        return {name: i % 8 == 7 for i, name in enumerate(names)}
+    held_out = read_split(tables[0])
+    print(f"split by {tables[0]}")
+    rest = set(names) - held_out.keys()
     if rest:
-        warn(f"{len(rest)} photos are not in {table}: {min(rest)} ...")
+        warn(f"{len(rest)} photos are not in {tables[0]}: {min(rest)} ...")
     return held_out
 
 
-def read_usable(model, held_out, downscale):
-    """{name: (rgb, K, c2w, ids)} of the photos that can be used; says which cannot, and why."""
+def read_usable(model, rows, held_out, downscale):
+    """{name: (rgb, K, c2w, rows of its points)} of the photos that can be used; says which cannot,
+    and why."""
     usable = {}
     for name in progress(sorted(held_out), "preparing photos"):
         try:
@@ -956,7 +954,8 @@ def read_usable(model, held_out, downscale):
             camera, pose, ids = model.photos[name]
             check_photo(camera, pose, held_out[name])
             image, K = read_photo(model.files[name], camera, downscale)
-            usable[name] = image, K, camera_to_world(pose), ids
+            own = [rows[key] for key in ids if key in rows]
+            usable[name] = image, K, camera_to_world(pose), array(own, int)
         except UserError as e:
             warn(f"left out: {name} {e}")
     lost = [name for name in held_out if held_out[name] and name not in usable]
@@ -980,29 +979,25 @@ def prepare(name, downscale=2, split=None):
     info = dict(scene=folder.resolve().name, kind="colmap", downscale=downscale,
                 folder=str(folder), images=str(model.images), split=split)
     info["files"] = fingerprint(info)
-    held_out = choose_parts(folder, model, split)
+    held_out = choose_parts(folder, model.names, split)
     points, rows = read_points(model.sparse)
-    usable = read_usable(model, held_out, downscale)
-    images, K, c2w, ids = zip(*usable.values())
+    usable = read_usable(model, rows, held_out, downscale)
+    images, K, c2w, tracks = zip(*usable.values())
     is_test = [held_out[name] for name in usable]
-    tracks = []
-    for own in ids:
-        own = [rows[key] for key in own if key in rows]
-        tracks.append(array(own, int))
     scene = finish(images, K, c2w, is_test, list(usable), points, tracks, info)
     uv = scene["track_uv"]
     share = (abs(uv - .5) <= .5).all(1).mean()
     says = f"only {share:.0%} of all sightings of points fall into the photo that saw them"
     photo = scene["track_photo"]
-    spread = median([np.std(uv[photo == i], axis=0).max() for i in np.unique(photo)])
+    spread = median([std(uv[photo == i], axis=0).max() for i in np.unique(photo)])
     is_sound = share >= .5 and spread > .02   # points in smaller units lie close together
     check(is_sound, f"{says}: give poses as COLMAP does, world to camera, x right, y down, "
           "z forward, in the units of the points")
     if share < .9:
         warn(says)
-    is_inside = norm(scene["points"], axis=1) < 1
+    inside = (lengths(scene["points"]) < 1).mean()
     print(f"the sphere has a radius of {scene['scale']:.3g} units of the reconstruction; "
-          f"{is_inside.mean():.0%} of the points are inside")
+          f"{inside:.0%} of the points are inside")
     return scene
 
 
@@ -1037,11 +1032,12 @@ def is_fresh(info):
 
 
 # ---- download, SfM, command line -----------------------------------------------------------------
-def fetch(url, path):
-    """Streams url into path, unless that exists; what came of a broken transfer waits in path.part
-    to be continued."""
+def fetch(folder_url, path):
+    """Streams the file of path's name into path, unless that exists; what came of a broken transfer
+    waits in path.part to be continued."""
     if path.exists():
         return
+    url = folder_url + path.name
     part = path.with_name(path.name + ".part")
     try:
         path.parent.mkdir(exist_ok=True)
@@ -1065,11 +1061,10 @@ def fetch(url, path):
 
 def unpack(archive, wanted, folder):
     """Files of a .tar.gz whose names start so; the whole archive is checked."""
-    with gzip.open(archive) as raw:
-        with tarfile.open(fileobj=raw, mode="r|") as tar:
-            for member in tar:   # files only: a link could lead outside
-                if member.isfile() and member.name.startswith(wanted):
-                    tar.extract(member, folder, filter="data")
+    with gzip.open(archive) as raw, tarfile.open(fileobj=raw, mode="r|") as tar:
+        for member in tar:   # files only: a link could lead outside
+            if member.isfile() and member.name.startswith(wanted):
+                tar.extract(member, folder, filter="data")
         while raw.read(1 << 20):   # to the checksum at the very end
             pass
 
@@ -1082,8 +1077,8 @@ def download(name):
     table = DATA / table
     archive = DATA / f"{scene}.tar.gz"
     check(not home.exists(), f"{home} is there already: move it, or leave --download out")
-    fetch(SPLIT_URL + table.name, table)
-    fetch(ARCHIVE_URL + archive.name, archive)
+    fetch(SPLIT_URL, table)
+    fetch(ARCHIVE_URL, archive)
     try:
         with tempfile.TemporaryDirectory(dir=DATA) as temporary:
             unpack(archive, (f"{scene}/dense/images/", f"{scene}/dense/sparse/"), temporary)

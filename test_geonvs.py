@@ -13,7 +13,6 @@ import itertools
 import json
 import math
 import os
-import pickle
 import re
 import resource
 import shutil
@@ -24,7 +23,6 @@ import subprocess
 import sys
 import tarfile
 import tracemalloc
-import zipfile
 from dataclasses import asdict, fields, replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -67,7 +65,7 @@ OCTANTS = list(itertools.product((0, 1), repeat=3))
 
 @functools.cache
 def toy(**knobs):
-    return data_prep.make_toy(**{**TINY_TOY, **knobs})
+    return data_prep.make_toy(**TINY_TOY | knobs)
 
 
 @pytest.fixture(scope="session")
@@ -102,9 +100,13 @@ def close(actual, wanted, tolerance=1e-5):
         actual, wanted, rtol=tolerance, atol=tolerance, check_dtype=False)
 
 
+def tiny(**changes):
+    return geonvs.Config(**TINY | changes)
+
+
 def make_model(scene, **changes):
     torch.manual_seed(0)
-    return geonvs.GeoNVS(geonvs.Config(**{**TINY, **changes}), scene)
+    return geonvs.GeoNVS(tiny(**changes), scene)
 
 
 @pytest.fixture(scope="session")
@@ -149,10 +151,6 @@ def gradients(model, value):
     return dict(zip(names, grads))
 
 
-def tiny(**changes):
-    return geonvs.Config(**TINY | changes)
-
-
 def assert_close(found, wanted, atol=1e-6):
     np.testing.assert_allclose(found, wanted, atol=atol, rtol=1e-5)
 
@@ -190,10 +188,6 @@ def own_points(scene, i):
     return scene["points"][own].astype(float)
 
 
-def info(scene):
-    return json.loads(str(scene["info"]))
-
-
 def same(a, b, *keys):
     for key in keys or a:
         is_float = np.asarray(a[key]).dtype.kind == "f"
@@ -203,38 +197,20 @@ def same(a, b, *keys):
 
 
 # ---- progress and scene files --------------------------------------------------------------------
-@pytest.mark.parametrize("is_terminal, seconds, count, numbers", [
-    (True, .9, 10, []),
-    (True, .5, 26, [21, 24, 26]),
-    (False, 1.01, 10, [10]),
-    (False, 25, 9, [3, 6, 9])])
+@pytest.mark.parametrize("is_terminal, seconds, count, text", [
+    (True, .9, 10, ""),
+    (True, .5, 26, "\r  counting: 21 of 26, 2 s left \r  counting: 24 of 26, 1 s left "
+                   "\r  counting: 26 of 26, 0 s left \n"),
+    (False, 1.01, 10, "  counting: 10 of 10, 0 s left \n"),
+    (False, 25, 9, "  counting: 3 of 9, 150 s left \n  counting: 6 of 9, 75 s left \n"
+                   "  counting: 9 of 9, 0 s left \n")])
 def test_progress_is_told_after_ten_seconds_on_a_terminal_and_a_minute_in_a_log_file(
-        is_terminal, seconds, count, numbers, monkeypatch, capsys):
+        is_terminal, seconds, count, text, monkeypatch, capsys):
     clock = itertools.count(100, seconds)
     monkeypatch.setattr(data_prep, "time", SimpleNamespace(monotonic=clock.__next__))
     monkeypatch.setattr(sys.stdout, "isatty", lambda: is_terminal, raising=False)
     assert list(data_prep.progress(range(count), "counting")) == list(range(count))
-    lines = [f"  counting: {n} of {count}, {seconds * (count - n):.0f} s left " for n in numbers]
-    out = capsys.readouterr().out
-    if is_terminal:   # a line is written over the one before
-        assert out == "".join("\r" + line for line in lines) + "\n" * bool(lines)
-    else:
-        assert out == "".join(line + "\n" for line in lines)
-
-
-def test_a_scene_survives_its_file_and_has_the_documented_arrays(tmp_path):
-    scene = toy(landmark=2)
-    data_prep.write_scene(tmp_path / "toy.npz", scene)
-    back = data_prep.read_scene(tmp_path / "toy.npz")
-    assert same(scene, back)
-    walls = {"wall", "wall_normal", "near_wall", "near_wall_sdf"}
-    assert set(back) == set(data_prep.FORMAT) | {"depth", "occluder"} | walls
-    assert info(back).items() >= dict(TINY_TOY, kind="toy", landmark=2, sun=0.0).items()
-
-
-def test_a_toy_depends_on_its_seed_alone():
-    assert same(toy(), data_prep.make_toy(**TINY_TOY))
-    assert not same(toy(), toy(seed=1), "c2w")
+    assert capsys.readouterr().out == text
 
 
 def zipped(scene, save=np.savez):
@@ -243,9 +219,9 @@ def zipped(scene, save=np.savez):
     return file.getvalue()
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def stored():
-    return data_prep.make_toy(size=16, photos=4, test=1)
+    return toy(size=16, photos=4, test=1)
 
 
 def accepts(path, data):
@@ -256,17 +232,16 @@ def accepts(path, data):
     except UserError as e:
         assert "\n" not in str(e)
         return False
-    assert all(photo(scene, i).size for i in range(5))
+    assert photo(scene, 4).size
     assert np.isfinite(scene["points"][scene["track_point"]]).all()
     assert scene["c2w"][scene["track_photo"]].size
     return True
 
 
-def flipped(data, rng, low=0):
-    """The bytes, one to four bits of them flipped from place `low` on."""
+def flipped(data, rng, low):
+    """The bytes, one bit of them flipped at a place from `low` on."""
     data = bytearray(data)
-    for at in rng.integers(low, len(data), rng.integers(1, 5)):
-        data[at] ^= 1 << rng.integers(8)
+    data[rng.integers(low, len(data))] ^= 1 << rng.integers(8)
     return bytes(data)
 
 
@@ -275,19 +250,18 @@ def test_damaged_scene_files_do_no_harm(tmp_path, stored, seed):
     path = tmp_path / "s.npz"
     good = zipped(stored)
     rng = np.random.default_rng(seed)
-    directory = good.find(b"PK\1\2")   # the last part of a zip file
-    for low in (0, directory):
-        accepts(path, flipped(good, rng, low))
+    accepts(path, flipped(good, rng, good.find(b"PK\1\2")))   # the directory
     accepts(path, flipped(good[:300], rng, 60) + good[300:])   # the head of the first array
     assert not accepts(path, good[:rng.integers(len(good) - 23)])
     assert not accepts(path, rng.bytes(10 * seed))
+    assert accepts(path, good)
 
 
 @pytest.mark.parametrize("key", sorted(data_prep.FORMAT))
 def test_scene_files_with_a_wrong_array_are_refused(tmp_path, stored, key):
     path = tmp_path / "s.npz"
     array = np.asarray(stored[key])
-    wrong = [array[..., None], array.astype("S9"), array[:-1] if array.ndim else array[None]]
+    wrong = [array[None], array.astype("S9")]
     wrong += [np.array(text) for text in ("x", "[1]", "{}")]
     if array.dtype.kind == "f" and key != "bg_color":
         wrong.append(array * np.inf)
@@ -299,11 +273,11 @@ def test_scene_files_with_a_wrong_array_are_refused(tmp_path, stored, key):
         wrong += [array * 0 - 1, array * 0 + array.max() + 1]
     if key == "is_test":
         wrong.append(array | True)
-    without = {k: v for k, v in stored.items() if k != key}
-    assert not accepts(path, zipped(without))
+    missing = dict(stored)
+    del missing[key]
+    assert not accepts(path, zipped(missing))
     for value in wrong:
-        assert not accepts(path, zipped(without | {key: value})), value
-    assert accepts(path, zipped(stored))
+        assert not accepts(path, zipped(stored | {key: value})), value
 
 
 def peak(call, *args):
@@ -325,16 +299,12 @@ def test_zip_bombs_are_refused_unread(tmp_path, stored):
 
 @pytest.mark.parametrize("count", [10 ** 5, 2 ** 31, 2 ** 40, 2 ** 62, 2 ** 80])
 def test_promised_shapes_are_refused(tmp_path, stored, count):
-    path = tmp_path / "s.npz"
-    with zipfile.ZipFile(path, "w") as file:
-        for key, value in stored.items():
-            head = np.lib.format.header_data_from_array_1_0(value)
-            if key == "rgb":
-                head["shape"] = count, 3
-            array = io.BytesIO()
-            np.lib.format.write_array_header_1_0(array, head)
-            file.writestr(f"{key}.npy", array.getvalue() + value.tobytes())
-    assert not accepts(path, path.read_bytes())
+    good = zipped(stored)
+    head = f"{stored['rgb'].shape}, }}".encode()
+    more = f"{(count, 3)}, }}".encode()
+    spaces = b" " * (len(more) - len(head))
+    assert head + spaces in good
+    assert not accepts(tmp_path / "s.npz", good.replace(head + spaces, more))
 
 
 class Evil(str):
@@ -344,27 +314,20 @@ class Evil(str):
 
 
 def test_a_scene_file_never_runs_code(tmp_path, stored):
-    path = tmp_path / "s.npz"
-    harm = tmp_path / "harm"
-    evil = np.array([Evil(harm)] * 5, object)
-    assert not accepts(path, zipped(stored | dict(name=evil)))
-    assert not accepts(path, pickle.dumps(Evil(harm)))
-    assert not harm.exists()
-    pickle.loads(pickle.dumps(Evil(harm)))
-    assert harm.exists()   # it was live
+    evil = np.array([Evil(tmp_path / "harm")] * 5, object)
+    assert not accepts(tmp_path / "s.npz", zipped(stored | dict(name=evil)))
+    assert not Path(tmp_path, "harm").exists()
 
 
-@pytest.mark.parametrize("error, raised", [
-    (OSError(28, "No space left"), UserError), (KeyboardInterrupt(), KeyboardInterrupt)])
-def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path, error, raised):
+def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path):
     path = tmp_path / "sub" / "sub" / "scene.npz"
     data_prep.atomic_write(path, lambda part: part.write_text("old"))
 
     def write(part):
         assert part.suffix == ".npz"
         part.write_text("half")
-        raise error
-    with pytest.raises(raised):
+        raise OSError(28, "No space left")
+    with pytest.raises(UserError, match="No space left"):
         data_prep.atomic_write(path, write)
     with pytest.raises(UserError, match="encode"):   # as cv2.imwrite says no
         data_prep.atomic_write(path, lambda part: False)
@@ -380,82 +343,74 @@ def pixel_rays(scene, i):
     return c2w[:, 3], d, photo(scene, i, "depth").ravel().astype(float)
 
 
-def toy_units(x):
-    return np.array(x) * data_prep.TOY_SCALE + data_prep.TOY_ORIGIN
-
-
 @pytest.mark.parametrize("number", [1, 3, 10])
 def test_every_landmark_is_another_building_that_stands_in_the_unit_sphere(number):
     parts = data_prep.toy_parts(number, False)
-    scene = toy(landmark=number)
     change = np.abs(parts - data_prep.LANDMARK).max(0)
     assert change[0] == 0   # the shapes
     assert change[1:4].max() > .1
     assert change[8] > 0
-    kinds = np.repeat([0, 1, 2, 3], [2, 2, 3, 1])   # of materials: stones, walls, roofs, gold
-    old, new = kinds[np.stack([data_prep.LANDMARK, parts])[:, :, 8].astype(int)]
-    assert (old == new).all()
-    for i, part in enumerate(parts):
-        foot = part[1:4] - (0, 0, part[4])
-        others = [data_prep.part_sdf(other, foot[None]) for other in np.delete(parts, i, 0)]
-        assert foot[2] < 1e-9 or min(others) < .02   # nothing hangs in the air
+    for i, (_, x, y, z, half, *_) in enumerate(parts):   # nothing hangs in the air
+        foot = np.array([[x, y, z - half]])
+        others = [data_prep.part_sdf(other, foot) for other in np.delete(parts, i, 0)]
+        assert z - half < 1e-9 or min(others) < .02
+    first = [2, 16, 19, 21]   # of a column, the tower, the annex and the statue
+    assert_close(np.subtract(*parts[first, 3:5].T), np.subtract(*data_prep.LANDMARK[first, 3:5].T))
+    scene = toy(landmark=number)
     rng = np.random.default_rng(0)
-    x = toy_units(rng.uniform([-1.2, -.8, 0], [1.2, .8, 2.4], (60_000, 3)))
-    inside = x[data_prep.toy_sdf(x, False, number) < 0]
-    reach = np.linalg.norm((inside - scene["center"]) / scene["scale"], axis=1).max()
+    x = rng.uniform(-1.5, 1.5, (60_000, 3))   # in scene units
+    s = data_prep.toy_sdf(world(scene, x), False, number)
+    reach = np.linalg.norm(x[s < 0], axis=1).max()
     assert .75 < reach < 1
 
 
-@pytest.mark.parametrize("knobs", [
-    {}, dict(background=False), dict(occluders=.2, background=False)])
-def test_background_is_one_colour_exactly_when_most_rays_beyond_the_sphere_agree(knobs):
-    scene = toy(**knobs)
-    beyond = []
-    for i in np.flatnonzero(~scene["is_test"]):
-        o, d, _ = pixel_rays(scene, i)
-        misses = np.linalg.norm(np.cross(o, d), axis=1) > 1
-        beyond.append(photo(scene, i).reshape(-1, 3)[misses] / 255)
-    beyond = np.concatenate(beyond)
-    typical = np.median(beyond, 0)
-    agree = (np.abs(beyond - typical) < .02).all(1).mean()
-    is_one = agree > .6 and len(beyond) > 100   # in the last scene too few
-    np.testing.assert_allclose(scene["bg_color"], typical if is_one else [np.nan] * 3)
+@pytest.mark.parametrize("share, color", [(.65, 0), (.55, np.nan)])
+def test_background_is_one_colour_if_60_percent_of_the_training_rays_beyond_the_sphere_agree(
+        share, color):
+    scene = toy(background=False, photos=16, occluders=0.0)   # before black
+    rng = np.random.default_rng(0)
+    is_other = rng.random(len(scene["rgb"])) > share
+    is_other |= np.repeat(scene["is_test"], np.diff(scene["start"]))
+    rgb = np.where(is_other[:, None], rng.integers(9, 255, (len(is_other), 3)), scene["rgb"])
+    again = data_prep.statistics(scene | dict(rgb=rgb))
+    assert_close(again["bg_color"], [color] * 3)
 
 
 def test_near_footprint_and_track_uv_agree_with_naive_loops():
-    scene = toy(exposure=0.0, occluders=0.0)
+    scene = copy.deepcopy(toy(exposure=0.0, occluders=0.0))
+    scene["c2w"][0, :, 3] = own_points(scene, 0)[0]   # within a point
+    scene["track_photo"][scene["track_photo"] == 1] = 2   # sees none
+    again = data_prep.statistics(scene)
+    near = []
     sizes = []
-    for i, K in enumerate(scene["K"]):
+    for i, (K, c2w) in enumerate(zip(scene["K"], scene["c2w"])):
         points = own_points(scene, i)
-        uv, distance = data_prep.project(K, scene["c2w"][i], points)
-        places = scene["track_uv"][scene["track_photo"] == i]
-        assert_close(scene["near"][i], .8 * np.quantile(distance, .02))
+        distance = np.linalg.norm(points - c2w[:, 3], axis=1)
+        uv, _ = data_prep.project(K, c2w, points)
+        places = again["track_uv"][scene["track_photo"] == i]
+        near.append(.8 * np.quantile(distance, .02) if len(points) else .05)
         assert_close(places, np.clip(uv / scene["wh"][i], -1, 2))
         if not scene["is_test"][i]:
-            sizes += [t / K[0] for x, t in zip(points, distance) if np.linalg.norm(x) < 1]
-    assert_close(scene["footprint"], np.quantile(sizes, .25), atol=0)
+            sizes += list(distance[np.linalg.norm(points, axis=1) < 1] / K[0])
+    assert_close(again["near"], np.maximum(near, .02))
+    assert_close(again["footprint"], np.quantile(sizes, .25), atol=0)
 
 
-def test_near_of_cameras_without_points_and_within_their_only_point():
-    scene = toy()
-    c2w = scene["c2w"].copy()
-    c2w[1, :, 3] = scene["points"][0]
-    sightings = dict(track_photo=np.array([1, 3]), track_point=np.array([0, 1]))
-    near = data_prep.statistics(scene | sightings | dict(c2w=c2w))["near"]
-    assert_close(near[:2], (.05, .02))
+def test_a_few_rays_beyond_the_sphere_say_nothing_about_the_background():
+    assert_close(toy(background=False)["bg_color"], [0, 0, 0])
+    assert np.isnan(toy(background=False, occluders=.2)["bg_color"]).all()
 
 
 def test_exposure_spread_is_the_deviation_of_brightness_of_training_photos():
     plain = toy(exposure=0.0, occluders=0.0, photos=16)
-    spread = []
+    assert plain["exposure_spread"] < .01
     for exposure in (1.0, 2.0):
         scene = toy(exposure=exposure, occluders=0.0, photos=16)
-        spread.append(scene["exposure_spread"])
         training = np.flatnonzero(~scene["is_test"])
         offsets = [photo(scene, i).mean() - photo(plain, i).mean() for i in training]
-        assert abs(spread[-1] / (np.std(offsets) / 255) - 1) < .5
-    assert plain["exposure_spread"] < .01
-    assert .03 < spread[0] < spread[1] / 1.3
+        spread = np.std(offsets) / 255
+        assert .03 * exposure < spread
+        assert abs(scene["exposure_spread"] / spread - 1) < .5
 
 
 @pytest.mark.parametrize("knobs", [{}, dict(background=False), dict(landmark=4)])
@@ -473,60 +428,57 @@ def test_depth_is_where_the_distance_function_first_vanishes(knobs):
             assert (sdf(before) > -1e-3).mean() > .999
 
 
-def test_rays_go_through_the_centres_of_their_pixels_and_cameras_stand_upright():
+def test_cameras_stand_upright_and_what_is_behind_them_is_in_no_photo():
     scene = toy(pose_noise=3.0)
-    w, h = scene["wh"][1]
-    camera = scene["K"][1], scene["c2w"][1]
     o, d, _ = pixel_rays(scene, 1)
-    uv, distance = data_prep.project(*camera, o + 2.5 * d)
-    behind, _ = data_prep.project(*camera, o - d)
-    R = scene["c2w"][:, :, :3]
-    assert_close(uv, [(u + .5, v + .5) for v in range(h) for u in range(w)])
-    assert_close(distance, 2.5)
-    assert (behind < -1e8).all()
-    assert_close(np.linalg.det(R), 1)
-    assert (R[:, 2, 1] < -.5).all()   # y is down
+    uv, _ = data_prep.project(scene["K"][1], scene["c2w"][1], o - d)
+    assert (scene["c2w"][:, 2, 1] < -.5).all()   # y is down
+    assert (uv < -1e8).all()
 
 
-@pytest.mark.parametrize("shape, top", [(1, .5), (1, 0), (2, .2), (3, .5)])
-def test_the_distance_to_a_part_agrees_with_dense_samples_of_its_surface(shape, top):
-    rng = np.random.default_rng(1)
-    part = np.array([shape, .1, 0, .1, .3, .5, top, .3, 0])
-    x = rng.uniform(-1, 1, (150, 3))
-    surface = rng.uniform(-.9, .9, (400_000, 3))
-    surface = surface[np.abs(data_prep.part_sdf(part, surface)) < .004]
-    distance = data_prep.part_sdf(part, x)
-    brute = np.array([np.linalg.norm(surface - p, axis=1).min() for p in x])
-    assert np.abs(distance - brute)[distance > 0].max() < .07
+@pytest.mark.parametrize("shape, top, x, distance", [
+    (0, 0, (1, 2, .5), .5),
+    (1, 3, (6, 6, 2), 26 ** .5),
+    (1, 3, (1, 0, .5), -.5),
+    (1, 0, (2, 0, 3), 10 / 13 ** .5),
+    (2, 0, (0, 2, 3), 10 / 13 ** .5),
+    (2, 3, (3, 4, 2), 5 ** .5),
+    (3, 3, (3, 4, 12), 10)])
+def test_the_distance_to_a_part_agrees_with_its_closed_form(shape, top, x, distance):
+    part = np.array([shape, 0, 0, 0, 1, 3, top, 2, 0])   # 1 half high, 3 wide below, 2 deep
+    part[1:4] = move = shape * np.array([10, 20, 30])
+    assert_close(data_prep.part_sdf(part, np.array([x]) + move), distance)
+
+
+def test_walls_and_points_near_them_agree_with_the_distance_function():
+    scene = toy()
+
+    def sdf(x):
+        return data_prep.toy_sdf(world(scene, x)) / scene["scale"]
+    before = sdf(scene["wall"] + .004 * scene["wall_normal"])
+    assert len(before) > 100
+    assert_close(np.median(before), .004, atol=1e-4)
+    assert_close(sdf(scene["near_wall"]), scene["near_wall_sdf"])
+    assert np.abs(scene["near_wall_sdf"]).max() < .05
 
 
 def test_rays_end_on_the_part_that_they_are_said_to_hit():
     parts = data_prep.toy_parts(0, True)
-    o = np.array([[0, -4.0, 1]])
     d = np.random.default_rng(0).uniform(-1, 1, (999, 3))
-    t, which = data_prep.trace(o, d, parts)
+    t, which = data_prep.trace(np.array([[0, -4.0, 1]]), d, parts)
     hit = t < 20
-    x = o + t[hit, None] * d[hit]
-    assert hit.mean() > .4
+    x = [0, -4, 1] + t[hit, None] * d[hit]
     assert len(set(which[hit])) > 9
     assert_close(data_prep.part_sdf(parts[which[hit]], x), 0)
 
 
-def test_a_wall_that_faces_the_sun_is_bright_and_the_ground_behind_a_building_dark():
+def test_the_ground_behind_a_tower_is_darker_than_before_it_on_the_side_of_the_sun():
     parts = data_prep.toy_parts(0, True)
-    sun = data_prep.SUN   # before the building, y < 0
 
-    def brightness(o, d):
-        d = np.array([d]) + 1e-6
-        return data_prep.shade(np.array([o]), d, parts, True, sun).mean()
-    bright = brightness((-.5, -3, .05), (0, 1, 0))   # of the plinth
-    dark = brightness((-.5, 3, .05), (0, -1, 0))
-    assert bright > 2 * dark
-    tower = np.array([.87, .18, 5])
-    step = 1.2 * sun * (1, 1, 0) / np.hypot(*sun[:2])
-    shadow = brightness(tower - step, (0, 0, -1))
-    free = brightness(tower + step, (0, 0, -1))
-    assert shadow < .6 * free
+    def brightness(x, y):   # of the ground, from above
+        d = np.array([[1e-6, 1e-6, -1]])
+        return data_prep.shade(np.array([[x, y, 5]]), d, parts, True, data_prep.SUN).mean()
+    assert brightness(1.6, 1.1) < .6 * brightness(.1, -.75)
 
 
 def test_the_sun_turns_from_photo_to_photo_and_moves_nothing_else():
@@ -541,64 +493,54 @@ def test_the_sun_turns_from_photo_to_photo_and_moves_nothing_else():
 def test_people_cover_their_share_of_training_photos_and_nothing_else_changes():
     plain = toy(exposure=0.0, occluders=0.0, photos=16)
     other = toy(exposure=0.0, occluders=.3, photos=16)
-    free = ~other["occluder"]
+    people = other["occluder"]
     shares = np.array([photo(other, i, "occluder").mean() for i in range(18)])
     training = shares[~other["is_test"]]
-    assert np.array_equal(plain["rgb"][free], other["rgb"][free])
-    assert (other["rgb"][~free] > plain["rgb"][~free] + 50.0).mean() > .05   # in colours
+    assert np.array_equal(plain["rgb"][~people], other["rgb"][~people])
+    assert (other["rgb"][people] > plain["rgb"][people] + 50.0).mean() > .05   # in colours
     assert abs(training.mean() / .3 - 1.15) < .45
     assert max(training) > 2 * min(training)
     assert not shares[other["is_test"]].any()
-    assert not plain["occluder"].any()
 
 
-def test_points_lie_on_surfaces_but_for_noise_and_a_few_wild_ones():
-    scene = data_prep.make_toy(size=48, photos=12, test=2, exposure=0.0)
+def test_points_lie_on_surfaces_that_are_seen_but_for_noise_and_a_few_wild_ones():
+    scene = toy(size=48, photos=12, occluders=.3)
     x = world(scene, scene["points"].astype(float))
     miss = np.abs(data_prep.toy_sdf(x)) / scene["scale"]
-    assert abs(np.median(miss) - .0035) < .0025
-    assert abs((miss > .03).mean() - .025) < .0245
-    assert len(x) > 1000
-    assert np.bincount(scene["track_point"]).min() >= 2
-
-
-def test_photos_see_points_that_nothing_hides():
-    scene = toy(size=48, occluders=.3)
-    hidden = people = 0
-    for i in range(8):
+    hidden = []
+    for i in range(14):
         uv, distance = data_prep.project(scene["K"][i], scene["c2w"][i], own_points(scene, i))
         u, v = np.clip(uv.astype(int), 0, scene["wh"][i] - 1).T
-        hidden += (photo(scene, i, "depth")[v, u] < .8 * distance).sum()
-        people += photo(scene, i, "occluder")[v, u].sum()
-    count = len(scene["track_photo"])
-    assert hidden < .06 * count
-    assert people < .1 * count
+        is_behind = photo(scene, i, "depth")[v, u] < .8 * distance
+        hidden += list(is_behind | photo(scene, i, "occluder")[v, u])
+    assert abs(np.median(miss) - .0035) < .0025
+    assert .0005 < (miss > .03).mean() < .05
+    assert len(x) > 1000
+    assert np.bincount(scene["track_point"]).min() >= 2
+    assert np.mean(hidden) < .12
 
 
 def test_pose_noise_moves_training_photos_by_that_many_pixels_and_no_test_photo():
-    knobs = dict(size=20, photos=40, test=3, occluders=0.0)
-    clean = data_prep.make_toy(**knobs)
-    noisy = data_prep.make_toy(pose_noise=2.0, **knobs)
-    x = (toy_units([[0, 0, .7]]) - clean["center"]) / clean["scale"]
+    clean = toy(size=20, photos=40, occluders=0.0)
+    noisy = toy(size=20, photos=40, occluders=0.0, pose_noise=2.0)
+    training = ~clean["is_test"]
+    x = ([[12, -7, 7.6]] - clean["center"]) / clean["scale"]   # amid the landmark
     shift = []   # px
-    for K, *poses in zip(clean["K"], clean["c2w"], noisy["c2w"]):
-        before, after = (data_prep.project(K, pose, x)[0] for pose in poses)
-        shift.append(np.linalg.norm(after - before))
-    shift = np.array(shift)
-    moved = np.abs(clean["c2w"] - noisy["c2w"]).max((0, 1))
+    for K, before, after in zip(clean["K"], clean["c2w"], noisy["c2w"]):
+        uv, _ = data_prep.project(K, before, x)
+        shift.append(np.linalg.norm(data_prep.project(K, after, x)[0] - uv))
+    moved = np.abs(clean["c2w"] - noisy["c2w"])
     assert same(clean, noisy, "rgb", "K", "points", "scale", "center")
-    assert abs(np.sqrt((shift[~clean["is_test"]] ** 2).mean()) - 2.1) < .7
-    assert not shift[clean["is_test"]].any()
-    assert (moved > .01).all()   # turned and shifted
+    assert abs(np.sqrt(np.mean(np.square(shift)[training])) - 2.1) < .7
+    assert (moved.max(0) > .01).all()   # turned and shifted
+    assert not moved[~training].any()
 
 
 # ---- the sphere ----------------------------------------------------------------------------------
 def ball(count):
     """Random points of the unit ball (count,3)"""
-    rng = np.random.default_rng(0)
-    x = rng.normal(size=(count, 3))
-    x /= np.linalg.norm(x, axis=1, keepdims=True)
-    return rng.random((count, 1)) ** (1 / 3) * x
+    x = np.random.default_rng(0).uniform(-1, 1, (3 * count, 3))
+    return x[np.linalg.norm(x, axis=1) < 1][:count]
 
 
 def sphere(xyz, views=20, tracks=None, is_test=None, error=0, contain=()):
@@ -606,19 +548,16 @@ def sphere(xyz, views=20, tracks=None, is_test=None, error=0, contain=()):
     if tracks is None:
         tracks = [np.arange(len(xyz))] * 2
     n = len(tracks)
+    images = [np.zeros((2, 2, 3), np.uint8)] * n
+    poses = [np.eye(4)[:3]] * n
     points = np.zeros((len(xyz), 5))
     points[:, :3] = xyz
-    points[:, 3:] = np.stack(np.broadcast_arrays(error, views), -1)
+    points[:, 3] = error
+    points[:, 4] = views
+    is_test = is_test or [False] * n
+    names = ["a.png"] * n
     return data_prep.finish(
-        images=[np.zeros((2, 2, 3), np.uint8)] * n,
-        K=np.ones((n, 4)),
-        c2w=[np.eye(4)[:3]] * n,
-        is_test=is_test or [False] * n,
-        name=["a.png"] * n,
-        points=points,
-        tracks=tracks,
-        info={},
-        contain=contain)
+        images, np.ones((n, 4)), poses, is_test, names, points, tracks, {}, contain)
 
 
 def test_the_sphere_holds_a_ball_of_points_wherever_and_however_large_it_is():
@@ -628,12 +567,12 @@ def test_the_sphere_holds_a_ball_of_points_wherever_and_however_large_it_is():
     assert abs(scene["scale"] - 1.08) < .03
     assert_close(moved["center"], scene["center"] * 3 + [5, 6, 7])
     assert_close(moved["scale"], 3 * scene["scale"])
-    assert_close(world(scene, scene["c2w"][:, :, 3]), 0)
+    assert_close(world(moved, moved["c2w"][:, :, 3]), 0)
 
 
-@pytest.mark.parametrize("share, distance", [(.06, 10), (.1, 30), (.3, 20), (.01, 1e6)])
-def test_a_skyline_and_wild_points_do_not_blow_up_the_sphere(share, distance):
-    far = ball(int(2000 * share))
+@pytest.mark.parametrize("count, distance", [(120, 10), (200, 30), (600, 20), (20, 1e6)])
+def test_a_skyline_and_wild_points_do_not_blow_up_the_sphere(count, distance):
+    far = ball(count)
     far *= distance / np.linalg.norm(far, axis=1, keepdims=True)
     scene = sphere(np.concatenate([ball(2000), far]))
     assert abs(scene["scale"] - 1.08) < .1
@@ -655,10 +594,10 @@ def test_the_sphere_grows_until_most_training_photos_see_their_points_and_holds_
     views = np.where(xyz[:, 0] < 20, 20, 3)
     tracks = [np.arange(100), np.arange(2000, 2150), np.arange(2150, 2300)]
     assert sphere(xyz, views, tracks)["scale"] > 30
-    assert sphere(xyz, views, tracks, [False, True, True])["scale"] < 1.2
-    scene = sphere(xyz, views, tracks[:1])
+    scene = sphere(xyz, views, tracks, [False, True, True])
     corners = scene["center"] + [[0, 3, 4], [1, 0, 0]]
     larger = sphere(xyz, views, tracks[:1], contain=corners)
+    assert scene["scale"] < 1.2
     assert_close(larger["scale"], 5.1)
 
 
@@ -670,15 +609,13 @@ def test_points_of_three_views_and_small_errors_are_kept_if_there_are_500_of_the
     limit = np.quantile(error[views == 3], .95)
     good = np.flatnonzero((views == 3) & (error <= limit))
     assert_close(world(scene, scene["points"].astype(float)), xyz[good], atol=1e-4)
-    assert np.array_equal(scene["track_point"], np.tile(np.arange(len(good)), 2))
-    assert np.array_equal(scene["track_photo"], np.repeat([0, 1], len(good)))
     assert len(sphere(xyz[:2249], views[:2249])["points"]) == 2249
 
 
 # ---- COLMAP folders ------------------------------------------------------------------------------
-@pytest.fixture(scope="module")
+@pytest.fixture
 def source():
-    return data_prep.make_toy(size=40, photos=8, test=2)
+    return toy(size=40, photos=8)
 
 
 def colmap_model(scene):
@@ -686,7 +623,6 @@ def colmap_model(scene):
     No photo uses the camera 99, a broken fisheye."""
     cameras = {99: SimpleNamespace(model=5, w=0, h=0, numbers=[np.nan] * 8)}
     images = {}
-    tracks = {}   # of a point: photo and place in it, photo and place in it, ...
     for i, name in enumerate(map(str, scene["name"])):
         w, h = map(int, scene["wh"][i])
         cameras[3 * i + 7] = SimpleNamespace(model=1, w=w, h=h, numbers=scene["K"][i])
@@ -694,15 +630,13 @@ def colmap_model(scene):
         q = 2.5 * np.roll(Rotation.from_matrix(R).as_quat(), 1)   # w x y z, of any length
         t = -R @ world(scene, scene["c2w"][i, :, 3])
         own = scene["track_point"][scene["track_photo"] == i].tolist()
-        for j, point in enumerate(own):
-            tracks.setdefault(point, []).extend((i + 50, j))
         ids = [5 * point + 2 ** 40 for point in own] + [2 ** 64 - 1]   # a corner without a point
         images[name] = SimpleNamespace(
             id=i + 50, q=q, t=t, camera=3 * i + 7, name=name, points=ids)
     points = []
-    for k, track in tracks.items():
-        x = world(scene, scene["points"][k].astype(float))
-        points.append(SimpleNamespace(id=5 * k + 2 ** 40, x=x, error=.5, track=track))
+    views = np.bincount(scene["track_point"])
+    for k, x in enumerate(world(scene, scene["points"].astype(float))):
+        points.append(SimpleNamespace(id=5 * k + 2 ** 40, x=x, error=.5, views=views[k]))
     return SimpleNamespace(cameras=cameras, images=images, points=points)
 
 
@@ -711,19 +645,18 @@ def pack(layout, *values):
 
 
 def write_model(folder, model):
-    files = dict(cameras=[], images=[], points3D=[])
+    cameras, images, points = [], [], []
     for key, c in model.cameras.items():
-        files["cameras"].append(pack(f"iiQQ{len(c.numbers)}d", key, c.model, c.w, c.h, *c.numbers))
+        cameras.append(pack(f"iiQQ{len(c.numbers)}d", key, c.model, c.w, c.h, *c.numbers))
     for i in reversed(model.images.values()):
-        sightings = b"".join(pack("ddQ", 1.5, 2.5, key) for key in i.points)
         head = pack("I7dI", i.id, *i.q, *i.t, i.camera) + i.name.encode()
-        files["images"].append(head + pack("xQ", len(i.points)) + sightings)
+        sightings = [pack("ddQ", 1.5, 2.5, key) for key in i.points]
+        images.append(head + pack("xQ", len(i.points)) + b"".join(sightings))
     for p in model.points:
-        n = len(p.track)
-        record = pack(f"Q3d3BdQ{n}I", p.id, *p.x, 1, 2, 3, p.error, n // 2, *p.track)
-        files["points3D"].append(record)
+        head = pack("Q3d3BdQ", p.id, *p.x, 1, 2, 3, p.error, p.views)
+        points.append(head + bytes(8 * p.views))
     folder.mkdir(parents=True, exist_ok=True)
-    for name, records in files.items():
+    for name, records in ("cameras", cameras), ("images", images), ("points3D", points):
         (folder / f"{name}.bin").write_bytes(pack("Q", len(records)) + b"".join(records))
 
 
@@ -759,72 +692,56 @@ def assert_same_scene(scene, other):
 
 @pytest.mark.parametrize("images, sparse", [
     ("dense/images", "dense/sparse"), ("images", "sparse/0"), ("images", "colmap/sparse/0"),
-    ("images", "."), ("dense/0/images", "dense/0/sparse"), ("input", "distorted/sparse/0"),
-    (".", "sparse")])
+    ("images", "."), ("input", "distorted/sparse/0"), (".", "sparse")])
 def test_a_scene_survives_the_way_through_colmap_files_wherever_they_lie(
         desk, source, images, sparse):
     write_folder(desk / "place", source, images, sparse)
     scene = data_prep.prepare("place", downscale=1)
-    assert same(scene, source, "rgb", "is_test", "name", "wh", "start")
+    keys = ["rgb", "is_test", "name", "wh", "start", "track_photo", "track_point"]
+    assert same(scene, source, *keys)
     assert_close(scene["K"], source["K"])
     assert_close(scene["c2w"][..., :3], source["c2w"][..., :3])
     assert_close(world(scene, scene["c2w"][..., 3]), world(source, source["c2w"][..., 3]))
-    for i in range(10):   # each photo sees the same points of the world
-        mine, theirs = (world(s, own_points(s, i)).round(4) for s in (scene, source))
-        assert np.isin(theirs, mine).mean() > .9
-
-
-def test_names_may_have_folders_and_image_ids_mean_nothing(desk, source):
-    names = np.array(["a b/ü " + name for name in source["name"]])
-    model = write_folder(desk / "place", dict(source, name=names))
-    before = data_prep.prepare("place")
-    for image in model.images.values():
-        image.id = 1000 - image.id
-    write_model(SPARSE, model)
-    assert before["name"].tolist() == names.tolist()
-    assert_same_scene(data_prep.prepare("place"), before)
+    assert_close(world(scene, scene["points"]), world(source, source["points"]), atol=1e-4)
 
 
 def test_photos_shrink_as_a_mean_and_their_cameras_with_them(model, source):
     small = data_prep.prepare("place", downscale=3)
-    ratio = (source["wh"] // 3) / source["wh"]
-    assert np.array_equal(small["wh"], source["wh"] // 3)
-    assert_close(small["K"], source["K"] * np.tile(ratio, 2))
-    assert np.abs(photo(small, 0).mean((0, 1)) - photo(source, 0).mean((0, 1))).max() < 2
+    wh = source["wh"] // 3
+    assert np.array_equal(small["wh"], wh)
+    assert_close(small["K"], source["K"] * np.tile(wh / source["wh"], 2))
+    assert abs(photo(small, 0).mean() - photo(source, 0).mean()) < 2
 
 
-@pytest.mark.parametrize("mode, kind", [("L", "PNG"), ("CMYK", "JPEG")])
-def test_modes_and_rotations_of_photos_change_nothing(model, mode, kind):
+def test_a_turned_cmyk_photo_is_read_as_it_is_stored(model):
     from PIL import Image
-    picture = Image.open(PHOTO).convert("L").convert("RGB")
-    picture.save(PHOTO)
     before = data_prep.prepare("place", 1)
     turned = Image.Exif()
     turned[274] = 6   # by 90 degrees: COLMAP works on stored pixels
-    picture.convert(mode).save(PHOTO, kind, exif=turned, quality=98)
+    picture = Image.open(PHOTO).convert("CMYK")
+    picture.save(PHOTO, "JPEG", exif=turned, quality=98, subsampling=0)
     after = data_prep.prepare("place", 1)
     assert same(before, after, "wh", "K")
     assert np.abs(photo(before, 0).astype(float) - photo(after, 0)).mean() < 3
 
 
-@pytest.mark.parametrize("number, distortion", [
-    (2, (.2,)), (3, (-.15, .02)), (4, (.1, 0, .01, -.01)), (6, (.1, 0, .01, -.01, 0, 0, 0, 0))])
+@pytest.mark.parametrize("number, focal, distortion", [
+    (2, [70], [.2]), (4, [70, 72], [.1, 0, .01, -.01]),
+    (6, [70, 72], [.1, 0, .01, -.01, 0, 0, 0, .05])])
 def test_an_undistorted_photo_shows_nothing_but_photo_where_its_camera_says(
-        model, number, distortion):
+        model, number, focal, distortion):
     v, u = np.mgrid[:60, :90] + .5
     cv2.imwrite(str(PHOTO), (u + 2 * v).round().astype(np.uint8))
-    focal = [70, 72][number <= 3:]
-    numbers = *focal, 44, 31, *distortion
+    numbers = focal + [44, 31] + distortion
     model.cameras[7] = SimpleNamespace(model=number, w=90, h=60, numbers=numbers)
     write_model(SPARSE, model)
     scene = data_prep.prepare("place", 1)
-    fx, fy, cx, cy = scene["K"][0]
-    d = np.stack([(u - cx) / fx, (v - cy) / fy, np.ones_like(u)], 2).reshape(-1, 3)
-    M = np.array([[focal[0], 0, 44], [0, focal[-1], 31], [0, 0, 1.0]])
+    d = data_prep.rays(scene["K"][0], np.eye(4)[:3], 90, 60)
+    M = np.diag([70, focal[-1], 1.0])
+    M[:2, 2] = 44, 31
     padded = np.append(distortion, np.zeros(8))[:8]
-    wanted, _ = cv2.projectPoints(d, np.zeros(3), np.zeros(3), M, padded)
-    wanted = wanted.reshape(60, 90, 2) @ (1, 2)
-    miss = photo(scene, 0)[..., 0] - wanted
+    uv, _ = cv2.projectPoints(d, np.zeros(3), np.zeros(3), M, padded)
+    miss = photo(scene, 0)[..., 0].ravel() - uv[:, 0] @ (1, 2)
     assert np.abs(miss).max() < 3
     assert abs(miss.mean()) < .3   # half a pixel would be 1.5
 
@@ -835,18 +752,16 @@ def test_very_narrow_and_very_wide_photos_are_left_out_of_training_only(source, 
         f = 20 / np.tan(np.radians(angle) / 2)
         spoil(model, f"toy_00{i}.png", "numbers", (f, f, 20, 20))
     scene = data_prep.prepare("place")
-    assert set(source["name"]) - set(scene["name"]) == {"toy_000.png", "toy_001.png"}
+    assert scene["name"].tolist() == source["name"].tolist()[2:]
 
 
 @pytest.mark.parametrize("far", [1e300, -1e30, np.inf, np.nan])
 def test_points_absurdly_far_away_do_no_harm(model, far):
     clean = data_prep.prepare("place", 1)
-    track = model.points[0].track
-    for k in range(4):
-        *x, error = np.where(np.arange(4) == k, far, 1.0)
-        model.points.insert(0, SimpleNamespace(id=k, x=x, error=error, track=track))
-        for image in model.images.values():
-            image.points.append(k)
+    model.points.insert(0, SimpleNamespace(id=0, x=(1, 1, far), error=1, views=9))
+    model.points.insert(0, SimpleNamespace(id=1, x=(1, 1, 1), error=far, views=9))
+    for image in model.images.values():
+        image.points += 0, 1
     write_model(SPARSE, model)
     with np.errstate(all="raise"):
         scene = data_prep.prepare("place", 1)
@@ -882,18 +797,15 @@ def named(name):
 
 
 @pytest.mark.parametrize("change, says", [
-    (for_all("points", track=[]), "run colmap point_triangulator"),
+    (for_all("points", views=0), "run colmap point_triangulator"),
     (for_all("points", x=(1, 2, 3)), "coincide"),
     (for_all("images", camera=99), "run colmap image_undistorter"),
     (for_all("cameras", model=77), "run colmap image_undistorter"),
-    (lambda model: model.points.clear(), "run colmap point_triangulator"),
     (lambda model: model.points.__delitem__(slice(19, None)), "overlapping photos"),
     (only_tests_see, "no training photo"),
     (named("toy_001.png"), "'toy_001.png' occurs twice"),
-    (named("../toy_000.png"), "outside"),
     (named("/toy_000.png"), "outside"),
-    (named("..\\toy_000.png"), "outside"),
-    (named(""), "outside")])
+    (named("..\\toy_000.png"), "outside")])
 def test_an_unusable_model_gives_a_sentence_and_exit_code_2_and_writes_nothing(model, change, says):
     change(model)
     write_model(SPARSE, model)
@@ -902,18 +814,11 @@ def test_an_unusable_model_gives_a_sentence_and_exit_code_2_and_writes_nothing(m
 
 @pytest.mark.parametrize("path, says", [
     (IMAGES, "such as ['toy_000.png']: put them into place/images"),
-    (SPARSE, "run python data_prep.py place --sfm"),
-    (SPARSE / "cameras.bin", "cameras.bin is missing"),
-    (SPARSE / "points3D.bin", "run colmap point_triangulator")])
+    (SPARSE, "run python data_prep.py place --sfm, or for a text model colmap model_converter"),
+    (SPARSE / "points3D.bin", "points3D.bin is missing: copy the whole model, or for points run")])
 def test_what_is_missing_is_said(model, path, says):
     path.rename("elsewhere")
     assert_error("place", says)
-
-
-def test_for_a_model_in_text_form_the_command_that_converts_it_is_said(model):
-    for path in SPARSE.glob("*.bin"):
-        path.rename(path.with_suffix(".txt"))
-    assert_error("place", "colmap model_converter")
 
 
 def spoil(model, name, what, value):
@@ -934,16 +839,12 @@ def jpeg(h, w):
 
 
 @pytest.mark.parametrize("what, value, says", [
-    ("q", [np.nan] * 4, "no sound camera or pose"),
     ("q", [0.0] * 4, "no sound camera or pose"),
     ("t", (1.0, 2.0, -1e300), "no sound camera or pose"),
-    ("numbers", (-30, 30, 2, 1), "no sound camera or pose"),
     ("numbers", (30, 1e-300, 2, 1), "no sound camera or pose"),
     ("numbers", (30, 30, np.inf, 1), "no sound camera or pose"),
     ("camera", 12345, "no camera in the model"),
-    ("camera", 99, "a fisheye: run colmap image_undistorter"),
-    ("file", lambda data: b"", "is empty"),
-    ("file", lambda data: b"x", "no photo"),
+    ("file", lambda data: b"", "is empty, damaged, too large or no photo"),
     ("file", lambda data: data[:-20], "is cut off"),
     ("file", lambda data: jpeg(27, 40)[:-20], "is cut off"),
     ("file", lambda data: jpeg(7, 9), "has 9 x 7 pixels, its camera 40 x 27")])
@@ -951,12 +852,12 @@ def test_a_training_photo_that_cannot_be_used_is_left_out_and_named(
         model, source, what, value, says):
     spoil(model, "toy_000.png", what, value)
     code, out, err = run_main("place")
+    scene = data_prep.open_scene("place")
     assert code == 0
     assert err.startswith("left out: toy_000.png ")
     assert says in err
     assert err.count("\n") == 1
-    scene = data_prep.open_scene("place")
-    assert set(source["name"]) - set(scene["name"]) == {"toy_000.png"}
+    assert scene["name"].tolist() == source["name"].tolist()[1:]
 
 
 def test_all_photos_that_cannot_be_used_are_found_in_one_go_and_a_held_out_one_is_an_error(model):
@@ -969,50 +870,34 @@ def test_all_photos_that_cannot_be_used_are_found_in_one_go_and_a_held_out_one_i
     assert last.endswith("['toy_007.png']")
 
 
-def test_of_several_models_the_largest_is_taken_and_the_others_are_named(model):
-    images = model.images
-    for place, names in ("sparse/0", ["toy_000.png"]), ("sparse/1", list(images)[:4]):
-        model.images = {name: images[name] for name in names}
-        write_model(Path("place/dense", place), model)
+def test_of_several_models_the_largest_is_taken_and_what_that_leaves_out_is_said(model):
+    model.images = dict(list(model.images.items())[:4])
+    write_model(Path("place/dense/sparse/1"), model)
     shutil.copy(PHOTO, IMAGES / "more.JPG")
-    code, out, err = run_main("place", "--downscale", 1)
-    assert code == 0
-    assert "11 photos on disk, 10 posed by place/dense/sparse\n" in out
-    assert "1 posed by place/dense/sparse/0" in out
-    assert "4 posed by place/dense/sparse/1" in out
-
-
-def test_photos_are_found_behind_links_and_by_any_usual_type(desk, source):
-    source = source | dict(name=np.array([f"cam/{i}.ppm" for i in range(len(source["name"]))]))
-    write_folder(Path("place"), source)
-    shutil.move(IMAGES / "cam", "elsewhere")
-    (IMAGES / "cam").symlink_to(Path("elsewhere").resolve())
-    assert run_main("place", "--downscale", 1)[0] == 0
-    assert same(data_prep.open_scene("place", 1), source, "rgb", "name")
-
-
-def test_posed_photos_that_are_not_on_disk_are_counted(model):
-    (IMAGES / "toy_003.png").unlink()
+    Path(IMAGES, "toy_003.png").unlink()
     code, out, err = run_main("place")
     assert code == 0
+    assert "10 photos on disk, 9 posed by place/dense/sparse\n" in out
+    assert "4 posed by place/dense/sparse/1" in out
     assert "1 photos of place/dense/sparse are not on disk, such as ['toy_003.png']" in err
 
 
-def test_names_that_windows_wrote_are_read(model, source):
+def test_photos_are_found_by_names_with_folders_behind_links_and_as_windows_wrote_them(
+        desk, source):
+    names = [f"a b/ü {i}.ppm" for i in range(10)]
+    model = write_folder(Path("place"), source | dict(name=np.array(names)))
+    before = data_prep.prepare("place")
     for image in model.images.values():
-        image.name = f"cam\\{image.name}"
+        image.id = 1000 - image.id   # means nothing
+        image.name = image.name.replace("/", "\\")
     write_model(SPARSE, model)
-    IMAGES.rename("cam")
-    IMAGES.mkdir()
-    shutil.move("cam", IMAGES)
-    Path("place/toy.tsv").unlink()
-    scene = data_prep.open_scene("place", 1)
-    assert scene["name"].tolist() == [f"cam/{name}" for name in sorted(source["name"])]
+    shutil.move(IMAGES / "a b", "elsewhere")
+    (IMAGES / "a b").symlink_to(Path("elsewhere").resolve())
+    assert before["name"].tolist() == names
+    assert_same_scene(data_prep.prepare("place"), before)
 
 
 def test_of_equal_models_one_that_can_be_used_is_taken_without_a_word(model):
-    shutil.copytree(IMAGES, "place/raw/images")
-    write_model(Path("place/raw/sparse"), model)
     for_all("images", camera=99)(model)
     write_model(Path("place/models"), model)
     code, out, err = run_main("place")
@@ -1021,39 +906,16 @@ def test_of_equal_models_one_that_can_be_used_is_taken_without_a_word(model):
     assert "left out" not in out + err
 
 
-def camera_to_world(image, centre):
-    image.q = image.q * (1, -1, -1, -1)
-    image.t = centre
-
-
-def opengl(image, centre):
-    w, x, y, z = image.q
-    image.q = np.array([-x, w, -z, y])
-    image.t = image.t * (1, -1, -1)
-
-
-def larger_units(image, centre):
-    image.t = image.t * 1000
-
-
-def smaller_units(image, centre):
-    image.t = image.t / 1000
-
-
-@pytest.mark.parametrize("mistake, count, code, says", [
-    (camera_to_world, 10, 2, "give poses as COLMAP does, world to camera, x right, y down"),
-    (opengl, 10, 2, "give poses as COLMAP does, world to camera, x right, y down"),
-    (larger_units, 10, 2, "in the units of the points"),
-    (smaller_units, 10, 2, "in the units of the points"),
-    (opengl, 8, 2, "error: only"),
-    (opengl, 2, 0, "only"),
-    (opengl, 0, 0, "")])
+@pytest.mark.parametrize("count, code, says", [
+    (8, 2, "give poses as COLMAP does, world to camera, x right, y down"),
+    (2, 0, "only"),
+    (0, 0, "")])
 def test_poses_that_contradict_the_photos_are_refused_if_many_and_said_if_few(
-        model, source, mistake, count, code, says):
-    centres = world(source, source["c2w"][:, :, 3])
-    images = list(model.images.values())
-    for i in range(10 - count, 10):
-        mistake(images[i], centres[i])
+        model, count, code, says):
+    for image in list(model.images.values())[10 - count:]:   # as OpenGL has it
+        w, x, y, z = image.q
+        image.q = np.array([-x, w, -z, y])
+        image.t = image.t * (1, -1, -1)
     write_model(SPARSE, model)
     found, out, err = run_main("place")
     assert found == code
@@ -1066,9 +928,7 @@ def test_points_in_smaller_units_than_poses_are_refused(model):
     for p in model.points:
         p.x = centre + (p.x - centre) / 1000
     write_model(SPARSE, model)
-    code, out, err = run_main("place")
-    assert code == 2
-    assert "in the units of the points" in err
+    assert_error("place", "in the units of the points")
 
 
 def test_the_radius_of_the_sphere_and_the_share_of_points_inside_are_printed(model):
@@ -1113,14 +973,14 @@ def held_out(*argv):
 @pytest.mark.parametrize("name", ["nerfw_split.csv", "s.tsv"])
 def test_the_table_of_a_folder_is_used_and_named(model, name):
     TABLE.unlink()
-    rows = [f"toy_00{i}.png;{'test' if i == 5 else 'train'}" for i in range(9)]
-    Path("place", name).write_text("filename;split\n" + "\n".join(rows))
+    text = "filename;split\ntoy_000.png;train\ntoy_003.png;train\ntoy_005.png;test"
+    Path("place", name).write_text(text)
     Path("place/other.csv").write_text("a,b\n1,2\n")
     Path("place/._s.tsv").write_text("filename\tsplit\n")   # as a Mac leaves on other disks
     names, out, err = held_out()
     assert names == ["toy_005.png"]
     assert f"split by place/{name}" in out
-    assert "1 photos are not in" in err
+    assert "7 photos are not in" in err
 
 
 @pytest.mark.parametrize("given", [[], ["--split", "place/test_list.txt"]])
@@ -1181,13 +1041,12 @@ def test_a_scene_is_made_once_for_each_size_and_does_without_its_sources(model, 
 
 
 @pytest.mark.parametrize("path", [PHOTO, SPARSE / "images.bin", SPARSE / "points3D.bin", TABLE])
-def test_a_scene_is_made_anew_when_a_source_is_older_newer_or_larger(model, capsys, path):
+def test_a_scene_is_made_anew_when_a_source_is_older_or_larger(model, capsys, path):
     makes(capsys)
-    for seconds in (1000, 4 * 10 ** 9):
-        os.utime(path, (seconds, seconds))
-        assert makes(capsys)
+    os.utime(path, (1000, 1000))
+    assert makes(capsys)
     path.write_bytes(path.read_bytes() + b"\n")
-    os.utime(path, (seconds, seconds))
+    os.utime(path, (1000, 1000))
     assert makes(capsys)
 
 
@@ -1203,35 +1062,32 @@ def test_a_scene_is_made_anew_when_a_photo_or_a_model_goes_or_comes(model, capsy
 
 def test_a_split_named_once_stays_when_the_scene_is_made_again(model, capsys):
     table = Path("mine.tsv")   # not the folder's own
-    text = TABLE.read_text().replace("test", "train")
-    table.write_text(text.replace("train\ttoy_003", "test\ttoy_003"))
-    assert run_main("place", "--split", "mine.tsv", "--downscale", 1)[0] == 0
-    scene = data_prep.open_scene("place", 2)
-    assert scene["name"][scene["is_test"]].tolist() == ["toy_003.png"]
+    table.write_text("filename\tsplit\ntoy_000.png\ttrain\ntoy_001.png\ttrain\ntoy_003.png\ttest")
+    assert held_out("--split", "mine.tsv")[0] == ["toy_003.png"]
     os.utime(table, (1000, 1000))
     assert makes(capsys)
+    scene = data_prep.open_scene("place")
+    assert scene["name"][scene["is_test"]].tolist() == ["toy_003.png"]
     table.unlink()
     with pytest.raises(UserError, match="mine.tsv is missing"):
-        data_prep.open_scene("place", 4)
+        data_prep.open_scene("place")
 
 
 def test_every_folder_has_a_file_of_its_own(desk):
     names = ["toy", "sacre", "one/photos", "two/photos", "./toy", str(desk / "sacre")]
-    toy, sacre, photos, *others = paths = [str(data_prep.scene_path(name)) for name in names]
-    assert (toy, sacre) == ("data/toy.npz", "data/sacre.npz")
-    assert photos.startswith("data/photos-")
+    paths = [str(data_prep.scene_path(name)) for name in names]
+    assert paths[:2] == ["data/toy.npz", "data/sacre.npz"]
+    assert paths[2].startswith("data/photos-")
     assert len(set(paths)) == 6
-    assert str(data_prep.scene_path("one/../one/photos")) == photos
+    assert str(data_prep.scene_path("one/../one/photos")) == paths[2]
 
 
-def test_a_toy_stays_as_it_was_made(desk, monkeypatch):
-    data_prep.write_scene(Path("data/toy.npz"), toy(seed=1))
-    Path("toy.tsv").write_text("no business of the toy")
-    assert same(data_prep.open_scene("toy", 3), toy(seed=1))
-    Path("data/toy.npz").unlink()
-    made = toy()
-    monkeypatch.setattr(data_prep, "make_toy", lambda: made)
-    assert same(data_prep.open_scene("toy", 3), made)
+def test_a_toy_is_made_once(desk, monkeypatch):
+    make_toy = mock.Mock(return_value=toy())
+    monkeypatch.setattr(data_prep, "make_toy", make_toy)
+    data_prep.open_scene("toy")
+    assert same(data_prep.open_scene("toy", 3), toy())
+    make_toy.assert_called_once_with()
 
 
 @pytest.mark.parametrize("home", ["data/sacre", "data/sacre_coeur"])
@@ -1255,7 +1111,7 @@ def survives(read, *args):
 def damaged(tmp_path, source, request):
     """A file of a small model, its bytes, and what the readers make of it with other bytes."""
     model = colmap_model(source)
-    model.images = {name: model.images[name] for name in ("toy_000.png", "toy_001.png")}
+    model.images = dict(list(model.images.items())[:2])
     model.points = model.points[:3]
     write_model(tmp_path, model)
     path = tmp_path / request.param
@@ -1266,32 +1122,15 @@ def damaged(tmp_path, source, request):
     return path.name, path.read_bytes(), functools.partial(survives, read)
 
 
-def test_truncated_models_are_refused_wherever_they_end(damaged):
-    name, data, read = damaged
-    assert read(data)
-    for n in range(0, len(data), 7):
-        assert read(data[:n]) is None
-
-
 def test_promised_counts_are_noticed_before_memory_is_taken(damaged):
     name, data, read = damaged
     inner = {"cameras.bin": 0, "images.bin": data.find(b"png\0") + 4, "points3D.bin": 51}
+    assert read(data)
     for at in (0, inner[name]):
-        for count in (1000, 2 ** 31, 2 ** 40, 2 ** 63, 2 ** 64 - 1):
+        for count in (1000, 2 ** 40, 2 ** 64 - 1):
             result, size = peak(read, data[:at] + pack("Q", count) + data[at + 8:])
             assert result is None
             assert size < 2 ** 21
-
-
-def test_damaged_models_and_split_tables_do_no_harm(damaged, tmp_path):
-    name, data, read = damaged
-    rng = np.random.default_rng(0)
-    table = tmp_path / "s.tsv"
-    for i in range(40):
-        read(flipped(data, rng))
-        read(pack("Q", i % 4) + rng.bytes(i))
-        table.write_bytes(b"filename\tid\tsplit\n" + rng.bytes(100))
-        survives(data_prep.read_split, table)
 
 
 # ---- downloads -----------------------------------------------------------------------------------
@@ -1353,17 +1192,15 @@ def test_a_broken_download_goes_on_where_it_stopped_and_unpacks_what_is_wanted(s
     part = Path("data", TAR + ".part")
     server.limit = 20_000
     server.ranges = ranges
-    with pytest.raises(UserError, match="same command"):
-        data_prep.download("brandenburg")
+    assert "same command" in run_main("brandenburg", "--download")[2]
     assert part.stat().st_size == 20_000
     assert not HOME.exists()
     server.limit = None
-    data_prep.download("brandenburg")
+    assert "no binary COLMAP model" in run_main("brandenburg", "--download")[2]   # in this one
     assert server.asked[-1] == (TAR, 19_999 if ranges else 0)
     assert unpacked() == WANTED
     assert sorted(os.listdir("data")) == ["brandenburg", "brandenburg.tsv", TAR]
-    with pytest.raises(UserError, match="there already"):
-        data_prep.download("brandenburg")
+    assert "there already" in run_main("brandenburg", "--download")[2]
     assert len(server.asked) == 3   # nothing is fetched twice
 
 
@@ -1379,32 +1216,22 @@ def test_a_whole_part_is_used_and_a_longer_one_started_over(server):
     assert unpacked() == WANTED
 
 
-@pytest.mark.parametrize("name, says", [("sacre", "404"), ("nowhere", "--download knows")])
-def test_what_fails_of_a_download_is_said(server, name, says):
-    with pytest.raises(UserError, match=says):
-        data_prep.download(name)
-
-
 @pytest.mark.parametrize("evil", [
-    (DENSE + "images/../../../../evil.txt", b"x"), ("/evil.txt", b"x"), ("../evil.txt", b"x"),
-    (DENSE + "images/link", "/etc"), (DENSE + "images/link", "../../../.."),
-    ("brandenburg_gate/dense/images", "/tmp")])
+    (DENSE + "images/../../../../evil.txt", b"x"), (DENSE + "images/link", "/etc"),
+    (DENSE + "images/link", "../../../.."), ("brandenburg_gate/dense/images", "/tmp")])
 def test_archives_cannot_write_outside(server, desk, evil):
     server.files[TAR] = archive([*GOOD, evil, (DENSE + "images/link/evil.txt", b"x")])
     with contextlib.suppress(UserError):
         data_prep.download("brandenburg")
-    home = desk / HOME
-    assert all(home in path.parents for path in desk.rglob("evil.txt"))
+    assert all(desk / HOME in path.parents for path in desk.rglob("evil.txt"))
     assert not any(path.is_symlink() for path in desk.rglob("*"))
     assert os.listdir(desk) == ["data"]
 
 
 @pytest.mark.parametrize("damage", [
-    lambda b: b[:30_000],
-    lambda b: b"no archive",
-    lambda b: b[:9000] + b"?" * 99 + b[9099:],
-    lambda b: b[:-8] + b"????" + b[-4:],
-    lambda b: archive(GOOD[2:])])
+    lambda data: data[:30_000],
+    lambda data: data[:-8] + b"????" + data[-4:],
+    lambda data: archive(GOOD[2:])])
 def test_damaged_archives_are_named_and_leave_nothing(server, damage):
     server.files[TAR] = damage(server.files[TAR])
     with pytest.raises(UserError, match=TAR):
@@ -1414,16 +1241,18 @@ def test_damaged_archives_are_named_and_leave_nothing(server, damage):
 
 # ---- command line --------------------------------------------------------------------------------
 def test_the_command_line_makes_a_toy_with_any_knob(desk):
-    argv = "toy --size 32 --photos 6 --test 2 --no-background --occluders .2"
+    argv = "toy --size 32 --photos 6 --test 2 --no-background --occluders .2 --seed 1"
     code, out, err = run_main(*argv.split())
+    scene = data_prep.read_scene("data/toy.npz")
     assert code == 0
     assert "data/toy.npz: 8 photos, 2 of them" in out
-    assert same(data_prep.read_scene("data/toy.npz"), toy(occluders=.2, background=False))
+    assert same(scene, toy(occluders=.2, background=False, seed=1))
+    assert not same(scene, toy(occluders=.2, background=False), "c2w")
 
 
 @pytest.mark.parametrize("argv", [
     "toy --sizee 9", "toy --siz 32", "toy --size x", "", "nowhere", "brandenburg", "x --download",
-    "toy --occluders 2", "place --downscale 0", "place --downscale 16", "toy --pose_noise nan",
+    "toy --occluders .61", "place --downscale 0", "place --downscale 16", "toy --pose_noise nan",
     "toy --pose_noise inf", "toy --downscale 4", "toy --split x.tsv", "place --split x.tsv",
     "toy --exposure -1", "toy --exposure 2.1", "toy --seed -1", "place --size 9", "toy --size 15",
     "toy --photos 3", "toy --test -1", "toy --pose_noise -1", "toy --landmark -1", "toy --sun 181",
@@ -1436,7 +1265,7 @@ def test_misspelt_commands_exit_with_2(model, argv):
 
 
 @pytest.mark.parametrize("error, says", [
-    (KeyboardInterrupt(), "stopped"), (OSError(13, "denied"), "denied"), (MemoryError("a"), "a")])
+    (KeyboardInterrupt(), "stopped"), (OSError(13, "denied"), "denied")])
 def test_what_stops_a_command_is_one_sentence(desk, monkeypatch, error, says):
     stop = mock.create_autospec(data_prep.make_toy, side_effect=error)
     monkeypatch.setattr(data_prep, "make_toy", stop)
@@ -1453,7 +1282,7 @@ def pycolmap(desk, monkeypatch, source):
     fake.photos = desk / "raw"
     (fake.photos / "images").mkdir(parents=True)
     fake.incremental_mapping.return_value = {
-        i: mock.Mock(num_reg_images=lambda count=count: count) for i, count in enumerate((2, 9, 3))}
+        i: mock.Mock(**{"num_reg_images.return_value": n}) for i, n in enumerate((2, 9, 3))}
     fake.undistort_images.side_effect = lambda *_: write_folder(fake.photos, source)
     monkeypatch.setitem(sys.modules, "pycolmap", fake)
     return fake
@@ -1479,14 +1308,6 @@ def test_sfm_says_when_photos_do_not_match_and_when_pycolmap_is_missing(pycolmap
     assert "overlap" in run_main(pycolmap.photos, "--sfm")[2]
     monkeypatch.setitem(sys.modules, "pycolmap", None)
     assert "pycolmap" in run_main(pycolmap.photos, "--sfm")[2]
-
-
-def test_download_comes_first(desk, monkeypatch, source):
-    def download(name):
-        write_folder(Path("data", name), source)
-    monkeypatch.setattr(data_prep, "download", download)
-    assert run_main("sacre", "--download")[0] == 0
-    assert data_prep.scene_path("sacre").exists()
 
 
 # ---- 2 scene file and rays -----------------------------------------------------------------------
