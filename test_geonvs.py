@@ -3075,12 +3075,10 @@ class Rival(nn.Module):
         super().__init__()
         self.cfg = replace(cfg, mask="off")
         self.scene = scene
-        with torch.device(scene.c2w.device):
-            self.make_parts(cfg, scene)
+        self.make_parts(cfg, scene)
 
     def groups(self):
-        parameters = list(self.parameters())
-        return [dict(params=parameters, lr=self.cfg.lr_net)]
+        return [dict(params=list(self.parameters()), lr=self.cfg.lr_net)]
 
     def do_nothing(self, *_):
         pass
@@ -3120,8 +3118,7 @@ class RadianceField(nn.Module):
         h = self.second(torch.cat([pe, h], 2))  # (R,S,W)
         sigma = F.softplus(self.density(h)).squeeze(2)  # (R,S)
         neck = self.bottleneck(h)  # (R,S,W)
-        rgb = self.paint(neck, d, code)
-        return sigma, rgb, neck
+        return sigma, self.paint(neck, d, code), neck
 
     def paint(self, neck, d, code):
         """Colour (R,S,3) of samples with bottleneck (R,S,W), under an appearance code (R,A)."""
@@ -3142,8 +3139,7 @@ class NeRFW(Rival):
         self.coarse = RadianceField(cfg.hidden, self.code_dim)
         self.fine = RadianceField(cfg.hidden, self.code_dim)
         reach = torch.cdist(scene.c2w[:, :, 3], scene.points[::20])  # (I,K/20)
-        far = reach.quantile(0.999, dim=1)  # (I,)
-        self.far = nn.Buffer(far)
+        self.far = nn.Buffer(reach.quantile(0.999, dim=1))  # (I,)
         self.make_heads(len(scene.wh), cfg.hidden // 2)
 
     def make_heads(self, photos, half):
@@ -3156,7 +3152,7 @@ class NeRFW(Rival):
     def render(self, rays, code):
         n = self.cfg.samples
         if not torch.is_grad_enabled():
-            n = n * self.finer
+            n *= self.finer
         middle = code.new_full((len(code), 2 * n), 0.5)
         return self.trace(rays, code, middle)
 
@@ -3203,8 +3199,7 @@ class NeRFW(Rival):
             rgb=static + moving,
             w=w,
             sigma_t=sigma_t,
-            beta=beta.sum(1) + 0.03,
-            mask=w_t.sum(1))
+            beta=beta.sum(1) + 0.03)
 
     def losses(self, rays, photos, done, gen):
         """Squared error over learned variance, its log, a price on transients. NeRF-W Eq. 13"""
@@ -3236,17 +3231,15 @@ class HaNeRF(NeRFW):
         inputs = 3
         for outputs, kernel, stride in (64, 7, 1), (128, 4, 2), *[(256, 4, 2)] * 3:
             pad = (kernel - 1) // 2
-            parts.append(
-                nn.Conv2d(inputs, outputs, kernel, stride, pad, padding_mode="reflect"))
-            parts.append(nn.ReLU())
+            layer = nn.Conv2d(inputs, outputs, kernel, stride, pad, padding_mode="reflect")
+            parts += [layer, nn.ReLU()]
             inputs = outputs
         self.encoder = nn.Sequential(
             *parts,
             nn.AdaptiveAvgPool2d(1),
             nn.Conv2d(256, self.code_dim, 1),
             nn.Flatten())
-        bank = torch.zeros(photos, self.code_dim)
-        self.bank = nn.Buffer(bank)  # last code of each photo
+        self.bank = nn.Buffer(torch.zeros(photos, self.code_dim))  # last code of each photo
         self.mask_code = nn.Embedding(photos, 128)
         self.mask_mlp = nn.Sequential(
             layers(128 + 42, *[256] * 4),
@@ -3263,7 +3256,7 @@ class HaNeRF(NeRFW):
 
     def batch(self, photos, n, gen):
         """A square grid of rays over a random window of one photo."""
-        picked = photos[(geonvs.uniform(gen, 1) * len(photos)).long()]
+        picked = photos[geonvs.random_index(gen, len(photos), 1)]
         size = 0.5 + 0.5 * geonvs.uniform(gen, 1)
         corner = geonvs.uniform(gen, 2) * (1 - size)
         axis = torch.linspace(0, 1, math.isqrt(n), device=gen.device)
@@ -3281,8 +3274,7 @@ class HaNeRF(NeRFW):
         side = math.isqrt(R)
         jitter = geonvs.uniform(gen, R, 2 * self.cfg.samples)
         code = self.encode(photos)  # (1,A)
-        which = (geonvs.uniform(gen, 1) * len(self.bank)).long()
-        other = self.bank[which]
+        other = self.bank[geonvs.random_index(gen, len(self.bank), 1)]
         other = torch.where(other.any(), other, code.detach())  # (1,A) of another, once known
         self.bank[photos] = code.detach()
         codes = code.expand(R, -1)
@@ -3392,8 +3384,8 @@ def splat(center, cov, opacity, rgb, xy):
     columns = torch.cat([center, inverse, opacity[:, None], rgb], 1)  # (N,9)
     columns = F.pad(columns, (0, 0, 0, 1))  # (N+1,9) the last one is transparent
     columns = F.embedding(table, columns)  # (B,D,9)
-    x, y = (columns[:, :, :2] - middle[:, None]).unbind(2)  # (B,D) from the tile's middle
-    a, b, c, opacity = columns[:, :, 2:6].unbind(2)  # (B,D)
+    x, y = (columns[..., :2] - middle[:, None]).unbind(2)  # (B,D) from the tile's middle
+    a, b, c, opacity = columns[..., 2:6].unbind(2)  # (B,D)
     slope_x = a * x + b * y
     slope_y = b * x + c * y
     at_middle = torch.log(opacity + 1e-12) - (slope_x * x + slope_y * y) / 2
@@ -3410,7 +3402,7 @@ def splat(center, cov, opacity, rgb, xy):
     alpha = log_alpha.clamp(max=-1e-3).exp()
     w, trans = geonvs.composite(alpha.flatten(0, 1))  # (BP,D), (BP,)
     w = w.unflatten(0, (-1, P))
-    picture = w @ columns[:, :, 6:]  # (B,P,3)
+    picture = w @ columns[..., 6:]  # (B,P,3)
     which = of_ray * P + place  # (R,)
     return picture.flatten(0, 1)[which], trans[which]
 
@@ -3425,8 +3417,7 @@ class Splats(Rival):
     def make_parts(self, cfg, scene):
         radius = scene.points.norm(dim=1).max().clamp(min=3)
         sky = F.normalize(torch.randn(SHELL, 3))
-        shell = 2 * radius * sky
-        center = torch.cat([scene.points, shell])  # (N,3)
+        center = torch.cat([scene.points, 2 * radius * sky])  # (N,3)
         gaps = []
         for some in center.split(1024):
             nearest, _ = torch.cdist(some, center).topk(4, largest=False)
@@ -3435,8 +3426,7 @@ class Splats(Rival):
         N = len(center)
         self.center = nn.Parameter(center)
         self.log_size = nn.Parameter(size.log().repeat(1, 3))
-        no_turn = torch.tensor([1.0, 0, 0, 0])
-        self.turn = nn.Parameter(no_turn.repeat(N, 1))
+        self.turn = nn.Parameter(torch.tensor([1.0, 0, 0, 0]).repeat(N, 1))
         self.opacity = nn.Parameter(torch.zeros(N))
         self.feature = nn.Parameter(0.1 * torch.randn(N + 1, FEATURE))  # the last one of the sky
         self.paint = geonvs.mlp(FEATURE + cfg.appearance_dim, cfg.hidden, 3)
@@ -3445,14 +3435,15 @@ class Splats(Rival):
         self.views = {}  # by photo
 
     def groups(self):
-        return [
-            dict(params=[self.center], lr=2e-3),
-            dict(params=[self.log_size], lr=5e-2),
-            dict(params=[self.turn], lr=2e-2),
-            dict(params=[self.opacity], lr=5e-2),
-            dict(params=[self.feature], lr=2e-2),
-            dict(params=list(self.paint.parameters()), lr=2e-3),
-            dict(params=[self.appearance.weight], lr=self.cfg.lr_code)]
+        rates = [
+            ([self.center], 2e-3),
+            ([self.log_size], 5e-2),
+            ([self.turn], 2e-2),
+            ([self.opacity], 5e-2),
+            ([self.feature], 2e-2),
+            (list(self.paint.parameters()), 2e-3),
+            ([self.appearance.weight], self.cfg.lr_code)]
+        return [dict(params=parameters, lr=rate) for parameters, rate in rates]
 
     def render(self, rays, code):
         """rgb (R,3); the rays of each photo at once, under the code of the first of them. The
@@ -3462,10 +3453,9 @@ class Splats(Rival):
             if photo not in self.views:
                 with torch.no_grad():
                     self.views[photo] = self.view(photo)
-            mine = (rays.img == photo).nonzero()[:, 0]
+            mine = rays.img == photo  # (R,)
             xy = rays.uv[mine] * self.scene.wh[photo]  # px
-            picture = self.draw(self.views[photo], code[mine[0]], xy)
-            rgb = rgb.index_put((mine,), picture)
+            rgb[mine] = self.draw(self.views[photo], code[mine][0], xy)
         return dict(rgb=rgb, normal=torch.zeros_like(rgb))
 
     def view(self, photo):
@@ -3505,7 +3495,7 @@ class Splats(Rival):
         code = self.appearance.weight[photo]
         rgb = self.draw(self.view(photo), code, xy)
         loss = (rgb - rays.rgb).abs().mean()
-        return loss, dict(rgb=loss), dict(rgb=rgb)
+        return loss, dict(rgb=loss), {}
 
 
 # ---- What rows replace: the printed or the plainer form of a piece -------------------------------
@@ -3633,12 +3623,11 @@ STRESS = {  # knobs of the toy, the row of PIECES that is made for them, seeds
     "few photos": (dict(photos=8), "no SfM term", 3),
     "wrong poses": (dict(photos=24, pose_noise=3.0), "no curvature", 3),
     "other building": (dict(photos=24, landmark=3), "no curvature", 1)}
+WIDE = dict(rays=1024, samples=64, hidden=256, lr_net=5e-4)
 PUBLISHED = {
     geonvs.GeoNVS: {},
-    NeRFW: dict(
-        rays=1024, photos=1024, samples=64, hidden=256, lr_net=5e-4),
-    HaNeRF: dict(
-        rays=1024, photos=1, samples=64, hidden=256, lr_net=5e-4),
+    NeRFW: WIDE | dict(photos=1024),
+    HaNeRF: WIDE | dict(photos=1),
     Splats: SPLATS}
 SMALL = {  # what serves the toy best
     geonvs.GeoNVS: dict(rays=384, hidden=32, lr_net=1e-2, lr_grid=3e-2),
@@ -3707,8 +3696,7 @@ def run_row(run, given, row):
     saved = json.loads(path.read_text()) if path.exists() else {}
     if saved.get("key") != key:
         saved = dict(key=key, metrics=train_row(cfg, arrays, run, row))
-        text = json.dumps(saved)
-        data_prep.atomic_write(path, lambda part: part.write_text(text))
+        data_prep.atomic_write(path, lambda part: part.write_text(json.dumps(saved)))
     metrics = saved["metrics"]
     result = metrics.get("failed") or "{psnr:.2f} dB, {train_seconds:.0f} s".format(**metrics)
     print(f"{run}: {result}", flush=True)
@@ -3719,11 +3707,8 @@ def train_row(cfg, arrays, run, row):
     """Trains and scores, with what the row replaces; writes log.txt below run."""
     run.mkdir(parents=True, exist_ok=True)
     scene = geonvs.load_scene(arrays, geonvs.pick_device(cfg.device))
-    with contextlib.ExitStack() as stack:
-        for name, value in row.replaced.items():
-            stack.enter_context(mock.patch.object(geonvs, name, value))
-        log = stack.enter_context(open(run / "log.txt", "w"))
-        stack.enter_context(contextlib.redirect_stdout(log))
+    replaced = mock.patch.dict(vars(geonvs), row.replaced)
+    with replaced, open(run / "log.txt", "w") as log, contextlib.redirect_stdout(log):
         try:
             return geonvs.execute(cfg, scene, run, kind=row.kind)
         except UserError as error:
