@@ -2530,6 +2530,8 @@ def test_a_checkpoint_holds_no_bytes_of_photos_and_no_flags_of_their_pixels(
 
 
 ODD = (None, -1, "x", [], {"a": 1}, torch.full((5,), 2**62), Evil("harm"))
+
+
 def test_a_bad_checkpoint_is_refused_in_one_sentence(scene, desk):
     model, _ = run_training(scene, desk, steps=1)
     path = Path("checkpoint.pt")
