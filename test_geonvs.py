@@ -1323,19 +1323,15 @@ def odd():
 
 def test_a_ray_projects_back_to_the_centre_of_its_pixel_and_has_its_colour(odd):
     w, h = odd.wh[1].tolist()
-    focal, centre = odd.K[1].split(2)
     rays = geonvs.photo_rays(odd, 1)
     t = random(w * h, 1, low=0.5, high=9)
-    rows, cols = np.divmod(np.arange(w * h), w)
-    pixels = np.stack([cols, rows], 1) + 0.5
-    x = rays.at(t)[:, 0] - odd.c2w[1, :, 3]
-    camera = x @ odd.c2w[1, :, :3]
-    z = camera[:, 2:]
-    close(camera[:, :2] / z * focal + centre, pixels, 1e-3)
-    close(camera.norm(dim=1), t[:, 0])
+    x = rays.at(t)[:, 0].numpy()
+    found, distance = data_prep.project(odd.raw["K"][1], odd.raw["c2w"][1], x)
+    pixels = torch.cartesian_prod(torch.arange(h), torch.arange(w)).flip(1) + 0.5
+    assert_close(found, pixels, 1e-3)
+    assert_close(distance, t[:, 0])
     close(rays.uv * odd.wh[1], pixels)
     close(rays.rgb * 255, odd.rgb[odd.start[1]:odd.start[2]], 1e-4)
-    assert (z > 0).all()
 
 
 @pytest.mark.parametrize("part", [1.0, 0.5])
@@ -1350,12 +1346,19 @@ def test_random_rays_cover_the_left_part_of_a_photo_and_nothing_else(odd, part):
 
 
 def test_a_thumbnail_is_the_whole_photo_upright(scene):
-    w, h = scene.wh[1]
-    photo = scene.rgb[scene.start[1]:scene.start[2]]
-    photo = photo.reshape(h, w, 3).permute(2, 0, 1)
-    quarters = F.adaptive_avg_pool2d(photo.float(), 2)
+    quarters = cv2.resize(photo(scene.raw, 1), (2, 2), interpolation=cv2.INTER_AREA)
     found = F.adaptive_avg_pool2d(scene.thumbs[1].float(), 2)
-    close(found, quarters, 0.01)
+    close(found, quarters.transpose(2, 0, 1), 0.02)
+
+
+@pytest.mark.parametrize("long_side, wanted", [(100, 64), (300, 150), (600, 256)])
+def test_the_mask_sees_photos_at_half_their_size_within_bounds(long_side, wanted):
+    raw = toy() | dict(
+        wh=np.array([[long_side, 2]]),
+        start=np.array([0, 2 * long_side]),
+        rgb=np.zeros((2 * long_side, 3), np.uint8))
+    scene = geonvs.load_scene(raw)
+    assert scene.thumbs.shape == (1, 3, wanted, wanted)
 
 
 def test_a_ray_is_in_the_unit_sphere_exactly_within_its_interval(double):
@@ -1370,18 +1373,6 @@ def test_a_ray_is_in_the_unit_sphere_exactly_within_its_interval(double):
     assert torch.equal((t > t0) & (t < t1), is_inside)
     close(t0[is_empty], closest[is_empty])
     assert (t0 <= t1).all()
-
-
-@pytest.mark.parametrize("long_side, wanted", [(100, 64), (300, 150), (600, 256)])
-def test_the_mask_sees_photos_at_half_their_size_within_bounds(long_side, wanted):
-    raw = toy()
-    count = len(raw["wh"])
-    pixels = 2 * long_side
-    wh = np.tile([long_side, 2], (count, 1))
-    start = pixels * np.arange(count + 1)
-    rgb = np.zeros((count * pixels, 3), np.uint8)
-    scene = geonvs.load_scene(raw | dict(wh=wh, start=start, rgb=rgb))
-    assert scene.thumbs.shape == (count, 3, wanted, wanted)
 
 
 # ---- 3 octree ------------------------------------------------------------------------------------
@@ -1432,10 +1423,8 @@ class PlainOctree:
                 corner = [c + o for c, o in zip(cell, octant)]
                 if self.is_complete(level, corner):
                     key = octree.key(torch.tensor([level, *corner])).item()
-                    weight = 1.0
-                    for axis in range(3):
-                        weight = weight * (1 - (at[axis] - corner[axis]).abs())
-                    out[level] += weight * octree.features[self.rows[key]]
+                    weight = 1 - (at - torch.tensor(corner)).abs()  # (3,)
+                    out[level] += weight.prod() * octree.features[self.rows[key]]
         return out.flatten()
 
 
@@ -1454,27 +1443,9 @@ def test_a_lookup_and_its_gradient_equal_plain_loops(double):
     assert (wanted[:, 6] == 0).any()
 
 
-def test_the_field_is_continuous_across_all_faces_of_cells(double):
-    octree = make_tree()
-    level = octree.cells[:, :1]
-    place = random(len(level), 3)
-    place[:, 1] = 0.0
-    x = (octree.cells[:, 1:] + place) * octree.side(level) - 1.5
-    step = torch.tensor([0, 1e-9, 0])
-    close(octree(x - step), octree(x + step), 1e-6)
-
-
 def test_a_lookup_of_no_number_is_finite(double):
     x = torch.tensor([[math.nan, 0, 0], [math.inf, -math.inf, 1e30]])
     assert make_tree()(x).isfinite().all()
-
-
-def test_splitting_does_not_change_the_function(double):
-    octree = make_tree(share=0.2)
-    x = random(300, 3, low=-1.5, high=1.5)
-    before = octree(x).detach()
-    octree.split(octree.cells)
-    close(octree(x), before, 1e-12)
 
 
 def test_seeding_leaves_no_hanging_corner_around_points():
@@ -1519,22 +1490,16 @@ def test_the_worst_cells_at_the_surface_that_hold_the_error_are_split(monkeypatc
 
 # ---- 4 fields ------------------------------------------------------------------------------------
 
-class Quadratic(geonvs.SDFField):
-    """s = x A x + b x + 0.7 instead of a network."""
-    def forward(self, x):
-        return ((x @ self.A) * x).sum(1) + x @ self.b + 0.7, None
-
-
-def test_four_taps_give_the_laplacian_of_a_quadratic_and_the_gradient_of_a_plain_one(double):
-    field = Quadratic(geonvs.Octree(1.0, 1), 4)
-    field.A = torch.tensor([[1.0, 0.4, -2], [0.4, 3, 0.9], [-2, 0.9, -9]])
-    field.b = torch.tensor([1.0, 10, 100])
+def test_four_taps_give_gradient_and_laplacian_of_a_quadratic(double):
+    taps = torch.tensor(geonvs.TAPS)
+    slope = torch.tensor([1.0, 10, 100])
+    bend = torch.tensor([1.0, 3, -9])
     x = random(20, 3)
-    _, lap = field.derivatives(x, 0.3)
-    close(lap, torch.full((20,), 2 * (1.0 + 3 - 9)), 1e-8)
-    field.A = field.A.diag().diag()
-    grad, _ = field.derivatives(x, 0.3)
-    close(grad, 2 * x * field.A.diag() + field.b, 1e-8)
+    points = x[:, None] + 0.3 * taps
+    s = points @ slope + points**2 @ bend
+    grad, lap = geonvs.finite_differences(s, taps, 0.3)
+    close(grad, slope + 2 * bend * x, 1e-8)
+    close(lap, 2 * bend.sum().expand(20), 1e-8)
 
 
 def test_a_lipschitz_layer_starts_as_a_plain_one_and_reaches_its_bound_in_every_row(double):
@@ -1543,9 +1508,8 @@ def test_a_lipschitz_layer_starts_as_a_plain_one_and_reaches_its_bound_in_every_
     close(layer(x), F.linear(x, layer.weight, layer.bias))
     layer.c.data -= 2
     steepest = layer.weight.sign()
-    bound = layer.c.exp()
-    close((layer(steepest) - layer.bias).diag(), bound.expand(5))
-    assert ((layer(x) - layer.bias).abs().amax(1) <= bound * x.abs().amax(1)).all()
+    rise = layer(steepest) - layer.bias
+    close(rise.diag(), layer.c.exp().expand(5))
 
 
 # ---- 5 from SDF to colour ------------------------------------------------------------------------
@@ -1556,25 +1520,6 @@ def test_zeta_stays_between_a_floor_that_rises_with_training_and_a_fixed_bound(d
         deviation = geonvs.Deviation(zeta)
         deviation.bound(done, 500.0)
         close(deviation(), min(max(zeta, floor), 500.0), 1e-4)
-
-
-def test_light_that_passes_a_falling_field_is_the_ratio_of_sigmoids_at_its_ends(double):
-    sdf = random(9, 12, low=-0.4, high=0.6).sort(1, descending=True).values
-    _, passes = geonvs.composite(geonvs.neus_alpha(sdf, 11.0))
-    close(
-        passes,
-        torch.sigmoid(11 * sdf[:, -1]) / torch.sigmoid(11 * sdf[:, 0]))
-    assert not geonvs.neus_alpha(sdf.flip(1), 11.0).any()
-
-
-@pytest.mark.parametrize("zeta", [1.0, 1e2, 1e4])
-def test_weights_and_their_gradients_are_finite_at_any_magnitude(zeta):
-    sizes = 10.0 ** torch.arange(-6, 4)
-    values = torch.cat([-sizes, sizes])
-    sdf = torch.cartesian_prod(values, values, values).requires_grad_()
-    w, passes = geonvs.composite(geonvs.neus_alpha(sdf, zeta))
-    (w.square().sum() + passes.square().sum()).backward()
-    assert sdf.grad.isfinite().all()
 
 
 def test_inverse_cdf_inverts_the_cdf(double):
@@ -1589,41 +1534,29 @@ def test_inverse_cdf_inverts_the_cdf(double):
         close(found[row], np.interp(u[row], cdf, edges[row]), 1e-9)
 
 
-def linear_field(x):
-    return x[..., 0] + 10 * x[..., 1] + 100 * x[..., 2]
-
-
 def test_the_cache_is_linear_between_its_points():
     cache = geonvs.SDFCache(16)
+    slope = torch.tensor([1.0, 10, 100])
     x = random(5, 7, 3, low=-1)
-    cache.refresh(linear_field)
-    close(cache.sdf(x), linear_field(x), 1e-4)
+    cache.refresh(lambda x: x @ slope)
+    close(cache.sdf(x), x @ slope, 1e-4)
 
 
 def test_samples_crowd_at_the_first_surface_and_some_lie_everywhere(double):
     cache = geonvs.SDFCache(64)
     cache.refresh(lambda x: (x[:, 0] + 0.25).abs() - 0.15)  # a slab, x = -0.4 to -0.1
-    o = torch.tensor([[-3.0, 0.1, 0.2]]).expand(20, 3)
-    rays = fake_rays(o, torch.tensor([[1.0, 0, 0]]))
+    rays = fake_rays(torch.tensor([[-3.0, 0.1, 0.2]]), torch.tensor([[1.0, 0, 0]]))
     t0, t1 = geonvs.sphere_interval(rays)
-    jitter = random(20, 50)
+    jitter = random(1, 1000)
     soft = torch.tensor(64.0)
     t = cache.distances(rays, t0, t1, jitter, soft)
     x = t - 3
     close(t[:, [0, -1]], torch.cat([t0, t1], 1))
-    assert t.shape == (20, 52)
     assert (t.diff(dim=1) >= 0).all()
     assert 0.7 < ((x + 0.4).abs() < 0.1).double().mean() < 0.9
     assert 0.06 < (x > 0).double().mean() < 0.14
     assert (t <= cache.distances(rays, t0, t1, (jitter + 1) / 2, soft)).all()
     close(cache.distances(rays, t0, t1, jitter, 1000 * soft), t)  # not below a voxel
-
-
-def test_contraction_keeps_the_unit_ball_and_ends_at_two():
-    x = random(100, 3, low=-3, high=3)
-    length = x.norm(dim=1, keepdim=True)
-    beyond = x / length * (2 - 1 / length)
-    close(geonvs.contract(x), torch.where(length < 1, x, beyond))
 
 
 def plain_sdf(model, x):
@@ -1706,8 +1639,7 @@ def plain_render(model, ray, t, t0, t1, code, jitter):
     grad = 0.0
     middle, _ = plain_sdf(model, end)
     rise = 0.0
-    for signs in ((1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)):
-        tap = torch.tensor(signs) / math.sqrt(3)
+    for tap in torch.tensor(geonvs.TAPS[1:]):
         s, _ = plain_sdf(model, end + model.eps * tap)
         grad = grad + 3 / 4 * s * tap / model.eps
         rise = rise + (s - middle) / 4
@@ -1820,17 +1752,7 @@ def test_pixels_that_show_sfm_points_are_static(warm, scene):
     assert n == 32
 
 
-def test_the_lesson_leads_to_the_cheaper_of_an_error_and_its_price(double):
-    error = random(200)
-    price = random(200)
-    logit = random(200, low=-5, high=5).requires_grad_()
-    lesson = geonvs.transient_loss(logit, error, price)
-    grad, = torch.autograd.grad(lesson, logit)
-    M = (grad < 0).double()  # to which it leads
-    close((1 - M) * error + M * price, torch.minimum(error, price))
-
-
-@pytest.mark.parametrize("done, least", [(0.0, 0.0), (0.15, 0.25), (0.3, 1.0), (0.9, 9.0)])
+@pytest.mark.parametrize("done, least", [(0.0, 0.0), (0.15, 0.25), (0.3, 1.0)])
 def test_outliers_are_rejected_that_the_network_suspects_and_nothing_else(done, least):
     mask = (torch.arange(100) + 0.5) / 100
     wanted = torch.where(mask > least, 1.0, mask)
@@ -1870,36 +1792,10 @@ def test_phi_is_calibrated_on_the_foreground_however_few_rays_end_there(warm):
     assert phi.std() > 0.2
 
 
-@pytest.mark.parametrize("p50, p95, width", [(1.0, 9.0, 2.0), (2.0, 2.0, 1e-3)])
-def test_phi_is_a_sigmoid_about_the_upper_quartile(warm, p50, p95, width):
-    warm.mask.complexity.copy_(torch.tensor([p50, 2, p95]))
-    phi = warm.mask.phi(torch.tensor([2, 2 + width]), 0.8)
+def test_phi_has_a_width_if_all_quantiles_are_alike(warm):
+    warm.mask.complexity.fill_(2.0)
+    phi = warm.mask.phi(torch.tensor([2, 2.001]), 0.8)
     close(phi, [0.4, 0.8 / (1 + math.exp(-1))], 1e-3)
-
-
-def test_logits_are_read_where_each_ray_meets_its_photo(double):
-    at = (torch.arange(6) + 0.5) / 6
-    ramp = at + 10 * at[:, None]
-    logits = torch.stack([ramp, 3 * ramp])[:, None]
-    uv = random(20, 2)
-    u, v = uv.clamp(at[0], at[-1]).T  # the border goes on outside
-    factor = torch.tensor([1.0, 3.0]).repeat_interleave(10)
-    close(geonvs.sample_logits(logits, uv), factor * (u + 10 * v))
-
-
-@pytest.mark.parametrize("is_static", [True, False])
-def test_pixels_of_sfm_points_are_never_taught_transient(warm, is_static):
-    rays, photos = make_batch(warm)
-    logits = torch.zeros(4, 1, 32, 32, requires_grad=True)
-    warm.mask.logits = lambda photos: logits
-    warm.mask.static.fill_(is_static)
-    total, _, _ = warm.losses(
-        rays._replace(rgb=rays.rgb + 5),
-        photos,
-        0,
-        generator())
-    total.backward()
-    assert (logits.grad.sum() > 0) == is_static
 
 
 def test_observing_follows_errors_of_sfm_pixels_and_records_where_rays_end(warm):
@@ -2039,7 +1935,6 @@ def test_codes_and_background_follow_the_scene_unless_they_are_set(scene, settin
 @pytest.mark.parametrize("setting, held_out, trained, wanted", [
     ("auto", 9.0, -9.0, "off"),
     ("auto", -9.0, -3.0, "on"),
-    ("on", -9.0, -9.0, "on"),
     ("off", 9.0, 9.0, "off")])
 def test_an_automatic_mask_goes_off_if_it_marks_nothing_in_training_photos(
         warm, monkeypatch, setting, held_out, trained, wanted):
@@ -2062,23 +1957,20 @@ def test_no_cell_is_smaller_than_a_pixel_and_none_needlessly_large(scene, footpr
 
 
 def test_every_parameter_has_one_group_and_the_rate_of_its_kind(warm):
-    warm.cfg.lr_net = 0.1
-    warm.cfg.lr_grid = 0.2
-    warm.cfg.lr_code = 0.3
     rates = []
     for group in warm.groups():
         rates += [(id(p), group["lr"]) for p in group["params"]]
     wanted = []
     for name, p in warm.named_parameters():
-        rate = 0.1
+        rate = warm.cfg.lr_net
         if name.startswith("mask"):
             rate = 8e-3
         if name == "deviation.v":
             rate = 1e-3
         if "octree" in name:
-            rate = 0.2
+            rate = warm.cfg.lr_grid
         if "appearance" in name:
-            rate = 0.3
+            rate = warm.cfg.lr_code
         wanted.append((id(p), rate))
     assert sorted(rates) == sorted(wanted)
 
@@ -2135,12 +2027,6 @@ def test_mixed_precision_leaves_the_sdf_alone(warm, monkeypatch):
     assert mixed != full
     for name in ("opacity", "depth", "e_grad", "e_curv"):
         assert torch.equal(mixed_out[name], out[name])
-    wanted = gradients(warm, full)
-    for name, grad in gradients(warm, mixed).items():
-        if name.startswith("sdf"):
-            assert grad.dtype == torch.float32
-            assert grad.isfinite().all()
-            assert (grad - wanted[name]).norm() < 0.05 * wanted[name].norm()
 
 
 class OneDevice(TorchDispatchMode):
@@ -2163,61 +2049,27 @@ class MetaGenerator(torch.Generator):
     device = torch.device("meta")
 
 
-def train_on_meta(model, monkeypatch):
-    """Takes steps on a device that has no values to be asked for."""
-    monkeypatch.setattr(adam, "_device_dtype_check_for_fused", lambda *args, **kwargs: None)
-    photos = model.scene.photos(False).to("meta")
-    tensors = {}
-    for key, value in model.scene._asdict().items():
-        if torch.is_tensor(value):
-            tensors[key] = value.to("meta")
-    model.scene = model.scene._replace(**tensors)
-    model.to("meta")
-    for module in model.modules():
-        for name, value in vars(module).items():
-            if torch.is_tensor(value):
-                setattr(module, name, value.to("meta"))
-    optimizer = geonvs.make_optimizer(model)
-    with OneDevice():
-        for step in (7, 8):
-            terms = geonvs.training_step(
-                model,
-                optimizer,
-                photos,
-                step,
-                0.1,
-                MetaGenerator())
-    return terms
+def to_meta(value):
+    return value.to("meta") if torch.is_tensor(value) else value
 
 
 @pytest.mark.parametrize("mask", ["on", "off"])
 @pytest.mark.parametrize("parts", ["on", "off"])
 def test_a_step_stays_on_its_device_and_asks_it_for_no_value(scene, monkeypatch, parts, mask):
+    monkeypatch.setattr(adam, "_device_dtype_check_for_fused", lambda *args, **kwargs: None)
     model = make_model(scene, appearance=parts, background=parts, mask=mask)
-    terms = train_on_meta(model, monkeypatch)
+    model.scene = geonvs.Scene(*map(to_meta, scene))
+    model.to("meta")
+    for module in model.modules():
+        for name, value in vars(module).items():
+            setattr(module, name, to_meta(value))
+    optimizer = geonvs.make_optimizer(model)
+    photos = to_meta(scene.photos(False))
+    gen = MetaGenerator()
+    with OneDevice():
+        for step in (7, 8):
+            terms = geonvs.training_step(model, optimizer, photos, step, 0.1, gen)
     assert all(value.device.type == "meta" for value in terms.values())
-
-
-def host_index(mask, rays):
-    return mask.static[torch.zeros(64, dtype=torch.long), 0, 0]
-
-
-def asked_value(mask, phi):
-    return phi.mean() if mask.sum() > 0 else mask.mean()
-
-
-def host_constant(e_grad, e_curv):
-    return e_grad * torch.tensor(10.0).to(e_grad.device) + e_curv
-
-
-@pytest.mark.parametrize("place, name, fault", [
-    (geonvs.TransientMask, "is_static", host_index),
-    (geonvs, "gpl_loss", asked_value),
-    (geonvs, "complexity", host_constant)])
-def test_the_stand_in_for_a_gpu_catches_planted_faults(warm, monkeypatch, place, name, fault):
-    monkeypatch.setattr(place, name, fault)
-    with pytest.raises(RuntimeError):
-        train_on_meta(warm, monkeypatch)
 
 
 # ---- 1 settings ----------------------------------------------------------------------------------
@@ -2245,10 +2097,9 @@ def test_a_folder_is_not_taken_for_a_scene_of_its_name():
 
 @pytest.mark.parametrize("given, gpus, is_large", [
     ({}, 1, False),
-    (dict(data="toy"), 0, False),
     (dict(data="toy"), 1, True),
     (dict(scene="taj", steps=9), 1, True),
-    (dict(scene="taj", device="cpu"), 1, False)])
+    (dict(scene="taj"), 0, False)])
 def test_settings_are_defaults_then_large_for_photos_on_a_gpu_then_flags(
         monkeypatch, given, gpus, is_large):
     monkeypatch.setattr(torch.cuda, "device_count", lambda: gpus)
@@ -2273,12 +2124,9 @@ def measure(patch, reads):
     return meter
 
 
-@pytest.mark.parametrize("reads, joules", [
-    ([1000.0, 1003.0, 1003.0, 4600.0], 3600.0),
-    ([7.0, 7.0], 0.0),
-    ([9.0, 10.0, 2.0, 6.0], 5.0)])
-def test_meter_adds_up_what_a_counter_counts_beyond_a_restart(monkeypatch, reads, joules):
-    assert measure(monkeypatch, reads).joules == 50 + joules
+def test_meter_adds_up_what_a_counter_counts_beyond_a_restart(monkeypatch):
+    meter = measure(monkeypatch, [1000.0, 1003.0, 1003.0, 2.0, 6.0])
+    assert meter.joules == 50 + 3 + 0 + 0 + 4
 
 
 @pytest.mark.parametrize("reads", [[], [1.0], [1.0, 2.0]])
@@ -2305,10 +2153,7 @@ def test_rapl_sums_packages_without_their_parts_and_the_platform(tmp_path):
     assert counter() == 2.0
 
 
-@pytest.mark.parametrize("device, processes, joules", [
-    ("cuda:0", 1, 7),
-    ("cuda:1", 1, 2),
-    ("cuda:0", 2, 9)])
+@pytest.mark.parametrize("device, processes, joules", [("cuda:1", 1, 2), ("cuda:0", 2, 9)])
 def test_nvml_is_asked_for_the_gpus_that_torch_uses(monkeypatch, device, processes, joules):
     millijoules = {"GPU-0": 7000, "GPU-1": 2000}
     nvml = SimpleNamespace(
@@ -2352,10 +2197,6 @@ def read_saved(run):
     return saved
 
 
-def read_files(run):
-    return {file.name: file.read_bytes() for file in run.iterdir()}
-
-
 def assert_same_tensors(a, b):
     assert a.keys() == b.keys()
     for key in a:
@@ -2380,7 +2221,7 @@ def test_a_step_is_adams_on_the_gradient_of_its_losses(warm, scene):
     photos = scene.photos(False)
     twin = copy.deepcopy(warm)
     optimizer = geonvs.make_optimizer(warm)
-    adam = torch.optim.Adam(twin.groups(), **twin.adam, fused=True)
+    adam = geonvs.make_optimizer(twin)
     gen = generator()
     again = generator()
     for step in (30, 31):
@@ -2397,7 +2238,7 @@ def test_a_step_is_adams_on_the_gradient_of_its_losses(warm, scene):
 
 
 @pytest.mark.parametrize("step, done, share", [
-    (0, 0, 0.05), (9, 0, 0.5), (19, 0, 1), (500, 0, 1), (500, 0.5, 0.525), (9, 1, 0.025)])
+    (0, 0, 0.05), (19, 0, 1), (500, 0.5, 0.525), (9, 1, 0.025)])
 def test_the_learning_rate_warms_up_and_falls_by_a_cosine(warm, scene, step, done, share):
     optimizer = geonvs.make_optimizer(warm)
     geonvs.training_step(warm, optimizer, scene.photos(False), step, done, generator())
@@ -2417,21 +2258,26 @@ def test_a_budget_in_minutes_replaces_steps(scene, tmp_path, loop, monkeypatch):
     assert read_saved(tmp_path)["state"] == state
 
 
+def train_until(stop, scene, run, **changes):
+    """The checkpoint of a run that is stopped when a step's checkpoint is written."""
+    save = geonvs.save_checkpoint
+
+    def save_and_stop(path, model, optimizer, gen, state):
+        save(path, model, optimizer, gen, state)
+        if state["step"] == stop:
+            raise KeyboardInterrupt
+    with mock.patch.object(geonvs, "save_checkpoint", save_and_stop):
+        with pytest.raises(KeyboardInterrupt):
+            run_training(scene, run, **changes)
+    return read_saved(run)
+
+
 @pytest.mark.parametrize("stop", [5, 12, 13])
 def test_refining_and_deciding_on_the_mask_come_at_their_shares_of_training(
         scene, tmp_path, loop, monkeypatch, stop):
     pass_time(monkeypatch, seconds=100)
-    save = geonvs.save_checkpoint
-
-    def save_and_stop(*args):
-        save(*args)
-        if args[4]["step"] == stop:
-            raise KeyboardInterrupt
-    with monkeypatch.context() as patch:
-        patch.setattr(geonvs, "save_checkpoint", save_and_stop)
-        with pytest.raises(KeyboardInterrupt):
-            run_training(scene, tmp_path, steps=20)
-    run_training(scene, tmp_path, read_saved(tmp_path), steps=20)
+    saved = train_until(stop, scene, tmp_path, steps=20)
+    run_training(scene, tmp_path, saved, steps=20)
     events = [call[0] if isinstance(call, tuple) else call for call in loop]
     wanted = list(range(20))
     wanted.insert(12, "decide_mask")
@@ -2440,97 +2286,44 @@ def test_refining_and_deciding_on_the_mask_come_at_their_shares_of_training(
     assert events == wanted
 
 
-def test_a_finished_run_with_more_steps_refines_at_the_shares_to_come(scene, tmp_path, loop):
-    run_training(scene, tmp_path, steps=10)
-    del loop[:]
-    run_training(scene, tmp_path, read_saved(tmp_path), steps=20)
-    assert [call for call in loop if isinstance(call, str)] == ["refine", "decide_mask"]
-    assert loop.index("refine") == 2  # before step 12 of 20
-
-
 def test_a_log_line_is_written_whatever_the_number_of_photos_a_step(warm, tmp_path):
     warm.cfg.photos = 2000
     geonvs.report(warm, tmp_path / "log.jsonl", 0.5, dict(step=1), {})
     assert read_log(tmp_path)[0]["psnr"] > 0
 
 
-def test_a_run_of_one_step_decides_on_the_mask(scene, tmp_path, loop):
-    run_training(scene, tmp_path, steps=1)
-    assert loop[-1] == "decide_mask"
-
-
-def test_the_same_seed_gives_the_same_losses_whatever_was_there(
-        scene, tmp_path, monkeypatch):
-    pass_time(monkeypatch, seconds=30)
+def test_a_run_begins_anew_and_follows_its_seed(scene, tmp_path):
     for name in geonvs.RESULTS:
         (tmp_path / name).write_text("of a former run")
-    run_training(scene, tmp_path)
-    run_training(scene, tmp_path / "again")
-    run_training(scene, tmp_path / "other", seed=1)
-    log = read_log(tmp_path)
-    assert [line["step"] for line in log] == [1, 2, 3, 4, 5, 6]
-    assert {"psnr", "joules", "rgb", "eik", "curv", "gpl"} < set(log[0])
-    assert log == read_log(tmp_path / "again")
-    assert log[0]["rgb"] != read_log(tmp_path / "other")[0]["rgb"]
+    run_training(scene, tmp_path, steps=1)
+    run_training(scene, tmp_path / "other", steps=1, seed=1)
+    line, = read_log(tmp_path)
+    other, = read_log(tmp_path / "other")
+    assert {"psnr", "joules", "rgb", "eik", "curv", "gpl"} < set(line)
+    assert line["rgb"] != other["rgb"]
     assert not (tmp_path / "film.mp4").exists()
 
 
-def start_child(function, folder, **env):
-    """A new process that calls a function of this file in a folder."""
-    path = [str(Path(part).resolve()) for part in sys.path]
-    module = Path(__file__).stem
-    code = f"import sys; sys.path[:0] = {path}; import {module}; {module}.{function}()"
-    return subprocess.Popen(
-        [sys.executable, "-c", code],
-        cwd=folder,
-        env=os.environ | env,
-        text=True,
-        stdout=subprocess.PIPE)
-
-
-def train_and_hang():
-    """Trains five steps of eight, with a checkpoint at each, and never ends."""
-    patch = pytest.MonkeyPatch()
-    pass_time(patch, seconds=100)
-    step = geonvs.training_step
-
-    def hang_at_five(*args):
-        if args[3] == 5:
-            print("hanging", flush=True)
-            signal.pause()
-        return step(*args)
-    patch.setattr(geonvs, "training_step", hang_at_five)
-    run_training(geonvs.load_scene(toy()), Path(), steps=8)
-
-
-def test_a_run_resumed_after_sigkill_ends_bit_for_bit_like_the_uninterrupted_one(
-        scene, tmp_path, monkeypatch):
-    process = start_child("train_and_hang", tmp_path)
-    assert any("hanging" in line for line in process.stdout)
-    process.kill()
-    process.communicate()
+def test_a_resumed_run_ends_bit_for_bit_like_the_uninterrupted_one(scene, tmp_path, monkeypatch):
     pass_time(monkeypatch, seconds=100)
-    saved = read_saved(tmp_path)
-    assert saved["state"]["step"] == 5
+    saved = train_until(5, scene, tmp_path, steps=8)
     cfg = geonvs.Config(**saved["config"])
     resumed, _ = geonvs.train(cfg, scene, tmp_path, saved)
     whole, _ = run_training(scene, tmp_path / "whole", steps=8)
     assert_same_tensors(resumed.state_dict(), whole.state_dict())
     assert resumed.cfg == whole.cfg
-    assert read_log(tmp_path)[-1] == read_log(tmp_path / "whole")[-1]
+    assert read_log(tmp_path) == read_log(tmp_path / "whole")
 
 
-@pytest.mark.parametrize("before, joules", [(100.0, 107.0), (None, None)])
-def test_resuming_adds_time_and_energy_to_what_was_spent(
-        scene, tmp_path, loop, monkeypatch, before, joules):
+def test_resuming_adds_time_and_energy_to_what_was_spent(scene, tmp_path, loop, monkeypatch):
     run_training(scene, tmp_path)
     saved = read_saved(tmp_path)
-    saved["state"].update(joules=before, seconds=1000.0)
+    saved["state"].update(joules=100.0, seconds=1000.0)
     pass_time(monkeypatch, seconds=2)
     reads = itertools.chain([5.0, 5.0], itertools.repeat(12.0))
     monkeypatch.setattr(geonvs, "open_counter", lambda device: reads.__next__)
     _, state = run_training(scene, tmp_path, saved, steps=8)
-    assert state == dict(step=8, seconds=1004, joules=joules)
+    assert state == dict(step=8, seconds=1004, joules=107)
 
 
 def test_a_non_finite_loss_ends_at_the_next_line_and_the_last_checkpoint_is_good(
@@ -2542,55 +2335,34 @@ def test_a_non_finite_loss_ends_at_the_next_line_and_the_last_checkpoint_is_good
         total, *others = losses(self, rays, photos, done, gen)
         return total * (math.nan if done == 4 / 1000 else 1), *others
     monkeypatch.setattr(geonvs.GeoNVS, "losses", spoiled)
-    with pytest.raises(UserError, match="learning rates.*checkpoint.pt") as caught:
+    with pytest.raises(UserError, match="learning rates.*checkpoint.pt"):
         run_training(scene, tmp_path, steps=1000)
     saved = read_saved(tmp_path)
-    assert "\n" not in str(caught.value)
     assert [line["step"] for line in read_log(tmp_path)] == [1, 4]
     assert saved["state"]["step"] == 4
     assert all(value.isfinite().all() for value in saved["model"].values())
 
 
-def save_after_a_step(scene, path):
-    model = geonvs.GeoNVS(tiny(), scene)
-    optimizer = geonvs.make_optimizer(model)
-    gen = generator()
-    geonvs.training_step(model, optimizer, scene.photos(False), 0, 0.0, gen)
-    geonvs.save_checkpoint(path, model, optimizer, gen, geonvs.START)
-    return model
-
-
-def test_a_checkpoint_holds_no_bytes_of_photos_and_no_flags_of_their_pixels(scene, tmp_path):
-    save_after_a_step(scene, tmp_path / "a.pt")
-    values = torch.load(tmp_path / "a.pt")["model"].values()
+def test_a_checkpoint_holds_no_bytes_of_photos_and_no_flags_of_their_pixels(
+        scene, tmp_path, loop):
+    run_training(scene, tmp_path)
+    values = read_saved(tmp_path)["model"].values()
     assert {value.dtype for value in values} == {torch.float32}
 
 
-class EvilPickle:
-    """Makes a folder "harm" when it is unpickled."""
-    def __reduce__(self):
-        return os.mkdir, ("harm",)
+ODD = (None, -1, "x", [], {"a": 1}, torch.full((5,), 2**62), Evil("harm"))
 
 
-ODD = (None, -1, "x", [], {"a": 1}, torch.full((5,), 2**62))
-PARTS = ("config", "scene", "octrees", "model", "optimizer", "generator", "state")
-
-
-def test_a_bad_checkpoint_is_refused_in_one_sentence(scene, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def test_a_bad_checkpoint_is_refused_in_one_sentence(scene, desk):
+    model, _ = run_training(scene, desk, steps=1)
     path = Path("checkpoint.pt")
-    model = save_after_a_step(scene, path)
     whole = path.read_bytes()
     good = torch.load(path)
-    bad = [good | {key: odd} for key in PARTS for odd in ODD]
-    bad += [*ODD, good | dict(config=dict(a=1)), good | dict(state=dict(step=1))]
-    bad += [good | dict(state=EvilPickle())]
     files = [whole[:n] for n in (0, 99, len(whole) // 2, len(whole) - 9)]
-    for value in bad:
+    bad = [good | {key: odd} for key in good for odd in ODD]
+    for value in [*ODD, *bad]:
         torch.save(value, path)
         files.append(path.read_bytes())
-    torch.save(EvilPickle(), path, _use_new_zipfile_serialization=False)
-    files.append(path.read_bytes())
     for data in files:
         path.write_bytes(data)
         with pytest.raises(UserError, match="checkpoint.pt") as caught:
@@ -2598,19 +2370,19 @@ def test_a_bad_checkpoint_is_refused_in_one_sentence(scene, tmp_path, monkeypatc
             geonvs.restore(saved, path, model, generator())
         assert "\n" not in str(caught.value)
         assert path.read_bytes() == data
-    assert os.listdir() == ["checkpoint.pt"]
+    assert not Path("harm").exists()
 
 
 @pytest.mark.parametrize("changes", [dict(hidden=8), dict(levels=4), dict(background="off"), {}])
-def test_a_checkpoint_of_other_settings_or_split_is_refused_and_its_run_stays(
+def test_a_checkpoint_of_other_settings_or_split_is_refused_and_stays(
         scene, tmp_path, loop, changes):
     run_training(scene, tmp_path)
-    before = read_files(tmp_path)
+    before = (tmp_path / "checkpoint.pt").read_bytes()
     if not changes:
         scene = scene._replace(info=scene.info | dict(split="other.tsv"))
     with pytest.raises(UserError, match="does not fit"):
         run_training(scene, tmp_path, read_saved(tmp_path), **changes)
-    assert read_files(tmp_path) == before
+    assert (tmp_path / "checkpoint.pt").read_bytes() == before
 
 
 def train_as_one_of_two():
@@ -2618,20 +2390,19 @@ def train_as_one_of_two():
     geonvs.start_processes(CPU)
     patch = pytest.MonkeyPatch()
     pass_time(patch, seconds=10 - 9 * geonvs.RANK)
-    rays = []
-    make_rays = geonvs.make_rays
+    directions = []
+    losses = geonvs.GeoNVS.losses
 
-    def noted_rays(*args):
-        rays.append(make_rays(*args))
-        return rays[-1]
-    patch.setattr(geonvs, "make_rays", noted_rays)
+    def noted_losses(model, rays, *others):
+        directions.append(rays.d)
+        return losses(model, rays, *others)
+    patch.setattr(geonvs.GeoNVS, "losses", noted_losses)
     model, _ = run_training(geonvs.load_scene(toy()), Path("run"), minutes=1.0, steps=99)
     layer = torch.nn.Linear(1, 1, bias=False)
     layer.weight.grad = torch.full((1, 1), 1.0 + geonvs.RANK)
     geonvs.average_gradients(layer)
-    directions = torch.cat([some.d for some in rays if len(some.d) == 32])
     weights = dict(model.named_parameters())
-    torch.save((weights, directions, layer.weight.grad), f"{geonvs.RANK}.pt")
+    torch.save((weights, torch.cat(directions), layer.weight.grad), f"{geonvs.RANK}.pt")
 
 
 def test_several_processes_count_the_seconds_up_to_the_last_step(
@@ -2644,34 +2415,34 @@ def test_several_processes_count_the_seconds_up_to_the_last_step(
     assert state["seconds"] == 10
 
 
-@pytest.mark.parametrize("rank, wanted", [
-    (0, ["open", "wait", "open"]),
-    (1, ["wait", "open"])])
-def test_the_first_process_makes_the_scene_before_the_others_open_it(monkeypatch, rank, wanted):
-    events = []
-
-    def open_scene(*_):
-        events.append("open")
-
-    def stop(*_):
-        raise KeyboardInterrupt
+def test_the_first_process_makes_the_scene_before_the_others_open_it(monkeypatch):
+    events = mock.Mock()
     monkeypatch.setattr(geonvs, "RANKS", 2)
-    monkeypatch.setattr(geonvs, "RANK", rank)
     monkeypatch.setattr(geonvs, "start_processes", lambda device: None)
-    monkeypatch.setattr(geonvs.dist, "barrier", lambda: events.append("wait"))
-    monkeypatch.setattr(data_prep, "open_scene", open_scene)
-    monkeypatch.setattr(geonvs, "load_scene", stop)
+    monkeypatch.setattr(geonvs.dist, "barrier", events.wait)
+    monkeypatch.setattr(data_prep, "open_scene", events.open)
+    monkeypatch.setattr(geonvs, "load_scene", mock.Mock(side_effect=KeyboardInterrupt))
     with pytest.raises(KeyboardInterrupt):
         geonvs.main(["--device", "cpu"])
-    assert events == wanted
+    assert [name for name, _, _ in events.method_calls] == ["open", "wait", "open"]
 
 
 def test_two_processes_train_one_model_on_the_rays_of_both(tmp_path):
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = str(free.getsockname()[1])
-    env = dict(MASTER_ADDR="127.0.0.1", MASTER_PORT=port, WORLD_SIZE="2")
-    pair = [start_child("train_as_one_of_two", tmp_path, RANK=rank, **env) for rank in "01"]
+    path = [str(Path(part).resolve()) for part in sys.path]
+    module = Path(__file__).stem
+    code = f"import sys; sys.path[:0] = {path}; import {module}; {module}.train_as_one_of_two()"
+    env = os.environ | dict(MASTER_ADDR="127.0.0.1", MASTER_PORT=port, WORLD_SIZE="2")
+    pair = []
+    for rank in "01":
+        pair.append(subprocess.Popen(
+            [sys.executable, "-c", code],
+            cwd=tmp_path,
+            env=env | dict(RANK=rank),
+            text=True,
+            stdout=subprocess.PIPE))
     said, silence = [process.communicate(timeout=120)[0] for process in pair]
     assert "step 16" in said
     assert silence == ""
@@ -2697,10 +2468,8 @@ def test_psnr_is_20_for_errors_of_a_tenth_and_100_at_most():
 
 def plain_ssim(a, b):
     """By the equations of Wang et al. 2004, in Gaussian windows of 11 px, without a border."""
-    kernel = cv2.getGaussianKernel(11, 1.5)
-
     def mean(x):
-        return cv2.filter2D(x, -1, kernel @ kernel.T)[5:-5, 5:-5]
+        return cv2.GaussianBlur(x, (11, 11), 1.5)[5:-5, 5:-5]
     product = mean(a) * mean(b)
     squares = mean(a) ** 2 + mean(b) ** 2
     shared = mean(a * b) - product
@@ -2722,8 +2491,6 @@ def test_the_right_half_is_scored_in_8_bits_beside_the_row_means_of_the_left(wid
     assert row["psnr"] == pytest.approx(geonvs.psnr(got, want))
     assert row["psnr_floor"] == pytest.approx(geonvs.psnr(flat, want))
     assert row["ssim"] == pytest.approx(plain_ssim(got, want), rel=1e-6)
-    rgb[:, :half] = 0
-    assert geonvs.score(dict(truth=truth, rgb=rgb)) == row
 
 
 def test_lpips_gets_the_right_half_in_0_to_1_and_a_small_picture_has_no_score():
@@ -2740,42 +2507,27 @@ def test_lpips_gets_the_right_half_in_0_to_1_and_a_small_picture_has_no_score():
     assert row["ssim"] is row["lpips"] is None
 
 
-def paint(scene, colors, is_right):
-    """The scene with the right or left half of each held-out photo in one colour."""
-    rgb = scene.rgb.clone()
-    for photo, color in zip(scene.photos(True), colors):
-        w, h = scene.wh[photo]
-        pixels = rgb[scene.start[photo]:scene.start[photo + 1]]
-        halves = pixels.reshape(h, w, 3).tensor_split([w // 2], 1)
-        halves[is_right][:] = color
-    return scene._replace(rgb=rgb)
-
-
-COLORS = torch.tensor([[200, 20, 90], [30, 220, 60]])
-
-
-def test_codes_see_nothing_of_right_halves_and_the_model_stays(warm, scene):
-    before = copy.deepcopy(warm.state_dict())
-    photos = scene.photos(True)
-    codes = geonvs.fit_codes(warm, scene, photos, steps=8)
-    again = geonvs.fit_codes(warm, paint(scene, COLORS, True), photos, steps=8)
-    assert torch.equal(codes, again)
-    assert_same_tensors(warm.state_dict(), before)
+def test_fitting_codes_leaves_no_gradients_in_the_model(warm, scene):
+    geonvs.fit_codes(warm, scene, scene.photos(True), steps=1)
     assert all(p.grad is None and p.requires_grad for p in warm.parameters())
 
 
-def test_fitting_starts_from_the_mean_training_code_and_finds_each_photos_own(scene):
+def test_fitting_goes_from_the_mean_training_code_to_the_colour_of_each_left_half(scene):
+    raw = scene.raw | dict(rgb=np.full_like(scene.raw["rgb"], 255))
+    photos = scene.photos(True)
+    colors = np.array([[200, 20, 90], [30, 220, 60]])
+    for number, color in zip(photos, colors):
+        half = raw["wh"][number, 0] // 2
+        photo(raw, number)[:, :half] = color
     codes = random(8, 3)
     model = SimpleNamespace(
         codes=lambda: codes,
         render=lambda rays, code: dict(rgb=code),
         scene=scene)
-    painted = paint(scene, COLORS, False)
-    photos = scene.photos(True)
-    start = geonvs.fit_codes(model, painted, photos, steps=0)
-    found = geonvs.fit_codes(model, painted, photos)
+    start = geonvs.fit_codes(model, scene, photos, steps=0)
+    found = geonvs.fit_codes(model, geonvs.load_scene(raw), photos)
     assert_close(start, codes[~scene.is_test].mean(0).expand(2, 3))
-    assert_close(found, COLORS / 255, atol=0.03)
+    assert_close(found, colors / 255, atol=0.03)
 
 
 def test_without_codes_nothing_is_fitted(scene):
@@ -2785,46 +2537,39 @@ def test_without_codes_nothing_is_fitted(scene):
 
 
 @pytest.fixture
-def make_knowing(warm):
-    """Makes a model that knows a toy: people, the right halves of photos, its surface, moved
-    outwards; normals are multiplied by `sign`."""
-    def make(raw, outwards=0.0, sign=1):
-        def distance(x):
-            landmark = json.loads(str(raw["info"]))["landmark"]
-            s = data_prep.toy_sdf(x.numpy() * raw["scale"] + raw["center"], True, landmark)
-            return torch.as_tensor(s / raw["scale"]).float() - outwards
+def knowing(warm):
+    """A model that knows the toy: its surface and people, and the right halves of photos."""
+    raw = warm.scene.raw
 
-        def derivatives(x, eps):
-            steps = eps * torch.eye(3)
-            rises = [distance(x + step) - distance(x - step) for step in steps]
-            return sign * torch.stack(rises, 1), None
+    def distance(x):
+        s = data_prep.toy_sdf(x.numpy() * raw["scale"] + raw["center"])
+        return torch.as_tensor(s / raw["scale"]).float()
 
-        def render(rays, code):
-            is_right = rays.uv[:, :1] > 0.48
-            rgb = rays.rgb * is_right + 0 * code.sum()
-            return dict(rgb=rgb, normal=rays.d)
+    def derivatives(x, eps):
+        steps = eps * torch.eye(3)
+        rises = [distance(x + step) - distance(x - step) for step in steps]
+        return torch.stack(rises, 1), None
 
-        def logits(photos):
-            w, h = raw["wh"][photos[0]]
-            people = raw["occluder"][raw["start"][photos[0]]:][:w * h]
-            return torch.as_tensor(40.0 * people - 20).float().reshape(1, 1, h, w)
-        model = copy.deepcopy(warm)
-        model.distance = distance
-        model.sdf.derivatives = derivatives
-        model.render = render
-        model.mask.logits = logits
-        return model
-    return make
+    def render(rays, code):
+        is_right = rays.uv[:, :1] > 0.48
+        rgb = rays.rgb * is_right + 0 * code.sum()
+        return dict(rgb=rgb, normal=rays.d)
+
+    def logits(photos):
+        people = photo(raw, photos[0], "occluder")
+        return torch.as_tensor(40.0 * people - 20)[None, None].float()
+    warm.distance = distance
+    warm.sdf.derivatives = derivatives
+    warm.render = render
+    warm.mask.logits = logits
+    return warm
 
 
-def test_a_model_that_knows_the_right_halves_gets_perfect_scores(make_knowing, scene):
-    model = make_knowing(scene.raw)
-    scores, codes = geonvs.evaluate(model, scene)
+def test_a_model_that_knows_the_right_halves_gets_perfect_scores(knowing, scene):
+    scores, codes = geonvs.evaluate(knowing, scene)
     rows = scores["per_image"]
-    is_same = (codes == model.codes()).all(1)
+    is_same = (codes == knowing.codes()).all(1)
     assert scores["psnr"] == 100
-    assert scores["ssim"] == pytest.approx(1)
-    assert scores["lpips"] is None
     assert scores["psnr_floor"] == np.mean([row["psnr_floor"] for row in rows])
     assert [row["name"] for row in rows] == scene.raw["name"][scene.raw["is_test"]].tolist()
     assert torch.equal(is_same, ~scene.is_test)  # codes of test photos are fitted
@@ -2836,20 +2581,21 @@ def test_a_scene_without_held_out_photos_has_no_scores(warm, scene):
     assert scores == dict(per_image=[], psnr=None, psnr_floor=None, ssim=None, lpips=None)
 
 
-@pytest.mark.parametrize("landmark", [0, 2])
-def test_the_true_toy_has_no_error(make_knowing, landmark):
-    raw = toy(landmark=landmark, occluders=0.2)
-    truth = geonvs.toy_truth(make_knowing(raw), geonvs.load_scene(raw))
+def test_the_true_toy_has_no_error(knowing, scene):
+    truth = geonvs.toy_truth(knowing, scene)
     assert truth["sdf_error"] < 1e-6
     assert truth["normal_error"] < 0.5
     assert truth["mask_iou"] == 1
     assert truth["mask_static"] < 1e-6
 
 
-def test_toy_truth_measures_a_known_error(make_knowing, scene):
-    model = make_knowing(scene.raw, outwards=0.01, sign=-1)
-    model.mask.logits = lambda photos: torch.full((1, 1, 8, 8), math.log(3))  # M = 3/4
-    truth = geonvs.toy_truth(model, scene)
+def test_toy_truth_measures_a_known_error(knowing, scene):
+    true = knowing.distance
+    gradient = knowing.sdf.derivatives
+    knowing.distance = lambda x: true(x) - 0.01
+    knowing.sdf.derivatives = lambda x, eps: (-gradient(x, eps)[0], None)
+    knowing.mask.logits = lambda photos: torch.full((1, 1, 8, 8), math.log(3))  # M = 3/4
+    truth = geonvs.toy_truth(knowing, scene)
     is_test = np.repeat(scene.raw["is_test"], np.diff(scene.raw["start"]))
     assert truth["sdf_error"] == pytest.approx(0.01, rel=1e-3)
     assert truth["normal_error"] == pytest.approx(180, abs=0.5)
@@ -2857,12 +2603,12 @@ def test_toy_truth_measures_a_known_error(make_knowing, scene):
     assert truth["mask_static"] == pytest.approx(0.75)
 
 
-def test_a_rendered_photo_has_its_pixels_in_order(make_knowing, scene):
-    frame = geonvs.render_photo(make_knowing(scene.raw), scene, 1, torch.zeros(4))
-    w, h = scene.wh[1].tolist()
-    truth = scene.raw["rgb"][scene.start[1]:scene.start[2]].reshape(h, w, 3)
+def test_a_rendered_photo_has_its_pixels_in_order(knowing, scene):
+    frame = geonvs.render_photo(knowing, scene, 1, torch.zeros(4))
+    half = scene.wh[1, 0] // 2
+    truth = photo(scene.raw, 1)
     assert np.array_equal(geonvs.to_uint8(frame["truth"]), truth)
-    assert np.array_equal(frame["rgb"][:, w // 2:], frame["truth"][:, w // 2:])
+    assert np.array_equal(geonvs.to_uint8(frame["rgb"])[:, half:], truth[:, half:])
     assert_close(frame["normal"].reshape(-1, 3), geonvs.photo_rays(scene, 1).d)
 
 
@@ -2877,30 +2623,27 @@ def test_the_mesh_of_a_ball_is_that_ball_and_its_colours_are_seen_from_outside(w
     warm.cache.refresh(warm.distance)
     vertices, faces, colors = geonvs.extract_mesh(warm)
     x = (vertices - scene.raw["center"]) / scene.raw["scale"] - centre.numpy()
-    a, b, c = x[faces].transpose(1, 0, 2)
-    volume = (np.cross(a, b) * c).sum() / 6
-    is_bright = colors > 127
+    volume = np.linalg.det(x[faces]).sum() / 6  # positive if faces look outwards
+    is_clear = np.abs(x) > 0.1
     assert_close(np.linalg.norm(x, axis=1), np.full(len(x), 0.25), atol=2e-3)
     assert volume == pytest.approx(4 / 3 * math.pi * 0.25**3, rel=0.02)
-    assert (is_bright == (x > 0))[np.abs(x) > 0.1].all()
+    assert ((colors > 127) == (x > 0))[is_clear].all()
 
 
-@pytest.mark.parametrize("axis", range(3))
-def test_a_plane_of_a_mesh_ends_at_the_unit_sphere_in_cells_of_eps(warm, scene, axis):
-    warm.distance = lambda x: x[:, axis] - 0.01
-    warm.cache.refresh(lambda x: x[:, axis] - 0.03)  # some steps ago
+def test_a_plane_of_a_mesh_ends_at_the_unit_sphere_in_cells_of_eps(warm, scene):
+    warm.distance = lambda x: x[:, 0] - 0.01
+    warm.cache.refresh(lambda x: x[:, 0] - 0.03)  # some steps ago
     vertices, faces, _ = geonvs.extract_mesh(warm)
     x = (vertices - scene.raw["center"]) / scene.raw["scale"]
     side = np.ptp(x[faces], axis=1).max()
-    assert_close(x[:, axis], np.full(len(x), 0.01), atol=1e-3)
+    assert_close(x[:, 0], np.full(len(x), 0.01), atol=1e-3)
     assert np.linalg.norm(x, axis=1).max() == pytest.approx(1, abs=2 * warm.eps)
     assert side == pytest.approx(warm.eps, rel=0.01)
 
 
 @pytest.mark.parametrize("radius", [-0.1, 1.2])
 def test_a_field_without_a_surface_in_the_sphere_has_an_empty_mesh(warm, tmp_path, radius):
-    warm.sdf.network[2].weight.data.zero_()
-    warm.sdf.network[2].bias.data.fill_(0.25 - radius)  # s = |x| - radius
+    warm.distance = lambda x: x.norm(dim=1) - radius
     warm.cache.refresh(warm.distance)
     mesh = geonvs.extract_mesh(warm)
     geonvs.write_ply(tmp_path / "a.ply", *mesh)
@@ -2918,50 +2661,34 @@ def test_a_written_mesh_reads_back(tmp_path):
     lines = body.splitlines()
     assert re.findall(r"element (\w+ \d)", head) == ["vertex 5", "face 7"]
     assert_close(np.loadtxt(lines[:5]), np.hstack([vertices, colors]), atol=1e-3)
-    assert np.array_equal(np.loadtxt(lines[5:])[:, 1:], faces)
-    assert all(line.startswith("3 ") for line in lines[5:])
+    assert np.array_equal(np.loadtxt(lines[5:]), np.insert(faces, 0, 3, axis=1))
 
 
-def test_a_panel_shows_photo_render_normals_and_mask_from_left_to_right(
-        warm, scene, tmp_path, monkeypatch):
+@pytest.mark.parametrize("mask, count", [("on", 4), ("off", 3)])
+def test_a_panel_shows_photo_render_normals_and_a_mask_from_left_to_right(
+        warm, scene, tmp_path, monkeypatch, mask, count):
     def render_photo(model, scene, photo, code):
         assert torch.equal(code, codes[photo])
-        height = 24 - 12 * (photo == 0)
         colors = dict(truth=[1, 0, 0], rgb=[0, 1, 0], normal=[0, 0, 1])
-        return {key: np.full((height, 16, 3), color) for key, color in colors.items()}
+        return {key: np.full((24, 16, 3), color) for key, color in colors.items()}
     codes = random(8, 4)
+    warm.cfg.mask = mask
     monkeypatch.setattr(geonvs, "render_photo", render_photo)
-    monkeypatch.setattr(warm.mask, "logits", lambda photos: torch.full((1, 1, 8, 8), -0.5))
+    warm.mask.logits = lambda photos: torch.full((1, 1, 8, 8), -0.5)
     geonvs.write_panel(tmp_path / "a.png", warm, scene, codes, width=120)
     panel = cv2.imread(str(tmp_path / "a.png"))[:, :, ::-1]
-    pixels = 120 * (90 + 3 * 180)  # photo 0 is half as high as the others
-    assert panel.shape == (4 * 20 + pixels // 120, 4 * 120, 3)
-    for i, color in enumerate([[255, 0, 0], [0, 255, 0], [128, 128, 255], [96, 96, 96]]):
-        place = np.argwhere((panel == color).all(2))
-        columns = place[:, 1]
-        is_in_tile = columns // 120 == i
-        assert is_in_tile.sum() == pixels
-
-
-@pytest.mark.parametrize("setting, is_named", [("on", True), ("off", False)])
-def test_a_panel_names_the_mask_if_it_shows_one(
-        warm, scene, tmp_path, monkeypatch, setting, is_named):
-    warm.cfg.mask = setting
-    titles = []
-    monkeypatch.setattr(cv2, "putText", lambda row, text, *_: titles.append(text))
-    geonvs.write_panel(tmp_path / "a.png", warm, scene, warm.codes())
-    assert len(titles) == 4
-    for title in titles:
-        assert ("mask" in title) == is_named
+    tiles = panel.reshape(4, 200, count, 120, 3)[:, 20:]  # below the titles
+    wanted = np.array([[255, 0, 0], [0, 255, 0], [128, 128, 255], [96, 96, 96]])
+    assert (tiles == wanted[:count, None]).all()
 
 
 def test_keys_are_met_and_joined_by_straight_lines_also_if_they_are_empty():
     keys = random(5, 3)
     between = geonvs.in_between(keys, 17)
-    close(between[::4], keys, 1e-5)
-    close(between[1::4], (3 * keys[:-1] + keys[1:]) / 4, 1e-5)
+    close(between[::4], keys)
+    close(between[1::4], (3 * keys[:-1] + keys[1:]) / 4)
+    close(geonvs.in_between(keys[:1], 2), keys[[0, 0]])
     assert geonvs.in_between(keys[:, :0], 7).shape == (7, 0)  # a model without codes
-    close(geonvs.in_between(keys[:1], 2), keys[[0, 0]], 1e-5)
 
 
 def test_a_film_sways_sideways_through_the_lights_of_training_photos(
@@ -2970,27 +2697,24 @@ def test_a_film_sways_sideways_through_the_lights_of_training_photos(
     lights = []
 
     def render_photo(model, view, photo, code):
-        assert photo == photos[0]
         cameras.append(view.c2w[photo].clone())
         lights.append(code)
         w, h = view.wh[photo].tolist()
         return dict(rgb=np.full((h, w, 3), [1.0, 0, 0]))
-    photos = odd.photos(False)
-    before = odd.c2w.clone()
     monkeypatch.setattr(geonvs, "render_photo", render_photo)
     geonvs.film(warm, odd, tmp_path / "a.mp4")
+    photos = odd.photos(False)
     still = odd.c2w[photos[0]]
-    moves = (torch.stack(cameras) - still) / 0.1
-    sway = np.sin(np.arange(144) / 24)
+    sway = 0.1 * torch.sin(torch.arange(144) / 24)
+    wanted = still.repeat(144, 1, 1)
+    wanted[:, :, 3] += sway[:, None] * still[:, 0]
     video = cv2.VideoCapture(str(tmp_path / "a.mp4"))
-    frame = video.read()[1]
-    assert_close(moves[:, :, :3], torch.zeros(144, 3, 3))
-    assert_close(moves[:, :, 3], sway[:, None] * still[:, 0].numpy(), atol=1e-4)
-    assert_close(torch.stack(lights)[[0, -1]], warm.codes()[photos[[0, -1]]])
-    assert torch.equal(odd.c2w, before)
+    blue, _, red = cv2.mean(video.read()[1])[:3]
+    close(torch.stack(cameras), wanted)
+    close(torch.stack(lights)[[0, -1]], warm.codes()[photos[[0, -1]]])
     assert video.get(cv2.CAP_PROP_FRAME_COUNT) == 144
-    assert frame[:, :, 2].mean() > 200  # red, in OpenCV's order
-    assert frame[:, :, 0].mean() < 50
+    assert red > 200
+    assert blue < 50
 
 
 # ---- 11 command line, documents ------------------------------------------------------------------
@@ -3000,9 +2724,8 @@ RUN = Path("runs", "a")
 
 
 @pytest.fixture
-def command(tmp_path, monkeypatch, capsys):
+def command(desk, monkeypatch, capsys):
     """Runs a command line in a folder with the tiny toy; returns exit code and stderr."""
-    monkeypatch.chdir(tmp_path)
     data_prep.write_scene(Path("data", "toy.npz"), toy())
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 0)
     monkeypatch.setattr(geonvs, "fit_codes", lambda model, scene, photos: model.codes()[photos])
@@ -3031,7 +2754,7 @@ def test_one_command_trains_scores_and_writes_everything(command, monkeypatch):
     assert command(*FLAGS[:-1], "--seed=3", "--mask=on") == (0, "")
     run = Path("runs", "toy-geonvsw-3")
     metrics = json.loads((run / "metrics.json").read_text(), parse_constant=pytest.fail)
-    assert set(read_files(run)) == set(geonvs.RESULTS) - {"film.mp4"}
+    assert set(os.listdir(run)) == set(geonvs.RESULTS) - {"film.mp4"}
     assert metrics["config"] == asdict(tiny(seed=3, mask="on"))
     assert metrics["energy_wh"] == read_saved(run)["state"]["joules"] / 3600 > 0
     assert metrics["rays_per_second"] == pytest.approx(6 * 64 / metrics["train_seconds"])
@@ -3041,8 +2764,7 @@ def test_one_command_trains_scores_and_writes_everything(command, monkeypatch):
     assert 1e8 < metrics["peak_memory_bytes"] < 1e11
 
 
-def test_resume_goes_on_with_the_runs_own_settings_and_those_given(command, monkeypatch):
-    monkeypatch.setattr(geonvs, "finish", lambda *args: {})
+def test_resume_goes_on_with_the_runs_own_settings_and_those_given(command):
     command(*FLAGS, "--mask=on", "--minutes=1e-4")
     assert command("--resume", "--name=a", "--steps=8") == (0, "")  # the last budget counts
     saved = read_saved(RUN)
@@ -3053,14 +2775,11 @@ def test_resume_goes_on_with_the_runs_own_settings_and_those_given(command, monk
 def test_render_films_the_trained_model(command, monkeypatch):
     films = []
     monkeypatch.setattr(geonvs, "film", lambda model, scene, path: films.append((model, path)))
-    monkeypatch.setattr(geonvs, "finish", lambda *args: {})
     command(*FLAGS)
-    before = read_files(RUN)
     assert command("--render", "--name=a") == (0, "")
     model, path = films[0]
     assert path == RUN / "film.mp4"
     assert_same_tensors(model.state_dict(), read_saved(RUN)["model"])
-    assert read_files(RUN) == before
 
 
 @pytest.mark.parametrize("flags, word", [
@@ -3080,29 +2799,24 @@ def test_a_mistake_ends_with_code_2_and_one_line_and_no_folder(command, flags, w
     assert not Path("runs").exists()
 
 
-def test_a_full_disk_leaves_whole_files(command, monkeypatch):
-    monkeypatch.setattr(geonvs, "finish", lambda *args: {})
+def test_a_full_disk_leaves_the_old_checkpoint(command):
     command(*FLAGS)
     before = (RUN / "checkpoint.pt").read_bytes()
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, hard))  # a larger file cannot be written
     try:
-        resumed = command("--resume", "--name=a", "--steps=8")
-        fresh = command(*FLAGS, "--name=b")
+        answer = command("--resume", "--name=a", "--steps=8")
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-    assert_refused(resumed, "checkpoint.pt")
-    assert_refused(fresh, "checkpoint.pt")
+    assert_refused(answer, "checkpoint.pt")
     assert (RUN / "checkpoint.pt").read_bytes() == before
-    assert os.listdir("runs/b") == ["log.jsonl"]
 
 
 @pytest.mark.parametrize("problem, word", [
     (OSError(28, "No space left"), "No space left"),
     (KeyboardInterrupt(), "--resume"),
     (torch.OutOfMemoryError("Tried to allocate\n1 GiB"), "fewer --rays"),
-    (MemoryError(), "fewer --rays"),
-    (RuntimeError("can't allocate memory"), "fewer --rays")])
+    (MemoryError(), "fewer --rays")])
 def test_a_problem_in_training_ends_with_code_2_and_one_line(
         command, monkeypatch, problem, word):
     def fail(*args):
@@ -3127,16 +2841,12 @@ def test_processes_must_come_from_torchrun_and_share_the_rays(command, monkeypat
 
 @pytest.mark.parametrize("name, gpus, device", [
     ("auto", 2, "cuda:1"),
-    ("cuda", 2, "cuda:1"),
     ("cpu", 2, "cpu"),
     ("auto", 0, "cpu")])
 def test_each_process_takes_its_own_gpu(monkeypatch, name, gpus, device):
     monkeypatch.setattr(geonvs, "LOCAL_RANK", 1)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: gpus)
     assert str(geonvs.pick_device(name)) == device
-    monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
-    with pytest.raises(UserError, match="1 GPUs"):
-        geonvs.pick_device("cuda")
 
 
 CODE = Path(geonvs.__file__).read_text()
@@ -3188,12 +2898,10 @@ class Rival(nn.Module):
         super().__init__()
         self.cfg = replace(cfg, mask="off")
         self.scene = scene
-        with torch.device(scene.c2w.device):
-            self.make_parts(cfg, scene)
+        self.make_parts(cfg, scene)
 
     def groups(self):
-        parameters = list(self.parameters())
-        return [dict(params=parameters, lr=self.cfg.lr_net)]
+        return [dict(params=list(self.parameters()), lr=self.cfg.lr_net)]
 
     def do_nothing(self, *_):
         pass
@@ -3233,8 +2941,7 @@ class RadianceField(nn.Module):
         h = self.second(torch.cat([pe, h], 2))  # (R,S,W)
         sigma = F.softplus(self.density(h)).squeeze(2)  # (R,S)
         neck = self.bottleneck(h)  # (R,S,W)
-        rgb = self.paint(neck, d, code)
-        return sigma, rgb, neck
+        return sigma, self.paint(neck, d, code), neck
 
     def paint(self, neck, d, code):
         """Colour (R,S,3) of samples with bottleneck (R,S,W), under an appearance code (R,A)."""
@@ -3255,8 +2962,7 @@ class NeRFW(Rival):
         self.coarse = RadianceField(cfg.hidden, self.code_dim)
         self.fine = RadianceField(cfg.hidden, self.code_dim)
         reach = torch.cdist(scene.c2w[:, :, 3], scene.points[::20])  # (I,K/20)
-        far = reach.quantile(0.999, dim=1)  # (I,)
-        self.far = nn.Buffer(far)
+        self.far = nn.Buffer(reach.quantile(0.999, dim=1))  # (I,)
         self.make_heads(len(scene.wh), cfg.hidden // 2)
 
     def make_heads(self, photos, half):
@@ -3269,7 +2975,7 @@ class NeRFW(Rival):
     def render(self, rays, code):
         n = self.cfg.samples
         if not torch.is_grad_enabled():
-            n = n * self.finer
+            n *= self.finer
         middle = code.new_full((len(code), 2 * n), 0.5)
         return self.trace(rays, code, middle)
 
@@ -3316,8 +3022,7 @@ class NeRFW(Rival):
             rgb=static + moving,
             w=w,
             sigma_t=sigma_t,
-            beta=beta.sum(1) + 0.03,
-            mask=w_t.sum(1))
+            beta=beta.sum(1) + 0.03)
 
     def losses(self, rays, photos, done, gen):
         """Squared error over learned variance, its log, a price on transients. NeRF-W Eq. 13"""
@@ -3349,17 +3054,15 @@ class HaNeRF(NeRFW):
         inputs = 3
         for outputs, kernel, stride in (64, 7, 1), (128, 4, 2), *[(256, 4, 2)] * 3:
             pad = (kernel - 1) // 2
-            parts.append(
-                nn.Conv2d(inputs, outputs, kernel, stride, pad, padding_mode="reflect"))
-            parts.append(nn.ReLU())
+            layer = nn.Conv2d(inputs, outputs, kernel, stride, pad, padding_mode="reflect")
+            parts += [layer, nn.ReLU()]
             inputs = outputs
         self.encoder = nn.Sequential(
             *parts,
             nn.AdaptiveAvgPool2d(1),
             nn.Conv2d(256, self.code_dim, 1),
             nn.Flatten())
-        bank = torch.zeros(photos, self.code_dim)
-        self.bank = nn.Buffer(bank)  # last code of each photo
+        self.bank = nn.Buffer(torch.zeros(photos, self.code_dim))  # last code of each photo
         self.mask_code = nn.Embedding(photos, 128)
         self.mask_mlp = nn.Sequential(
             layers(128 + 42, *[256] * 4),
@@ -3376,7 +3079,7 @@ class HaNeRF(NeRFW):
 
     def batch(self, photos, n, gen):
         """A square grid of rays over a random window of one photo."""
-        picked = photos[(geonvs.uniform(gen, 1) * len(photos)).long()]
+        picked = photos[geonvs.random_index(gen, len(photos), 1)]
         size = 0.5 + 0.5 * geonvs.uniform(gen, 1)
         corner = geonvs.uniform(gen, 2) * (1 - size)
         axis = torch.linspace(0, 1, math.isqrt(n), device=gen.device)
@@ -3394,8 +3097,7 @@ class HaNeRF(NeRFW):
         side = math.isqrt(R)
         jitter = geonvs.uniform(gen, R, 2 * self.cfg.samples)
         code = self.encode(photos)  # (1,A)
-        which = (geonvs.uniform(gen, 1) * len(self.bank)).long()
-        other = self.bank[which]
+        other = self.bank[geonvs.random_index(gen, len(self.bank), 1)]
         other = torch.where(other.any(), other, code.detach())  # (1,A) of another, once known
         self.bank[photos] = code.detach()
         codes = code.expand(R, -1)
@@ -3505,8 +3207,8 @@ def splat(center, cov, opacity, rgb, xy):
     columns = torch.cat([center, inverse, opacity[:, None], rgb], 1)  # (N,9)
     columns = F.pad(columns, (0, 0, 0, 1))  # (N+1,9) the last one is transparent
     columns = F.embedding(table, columns)  # (B,D,9)
-    x, y = (columns[:, :, :2] - middle[:, None]).unbind(2)  # (B,D) from the tile's middle
-    a, b, c, opacity = columns[:, :, 2:6].unbind(2)  # (B,D)
+    x, y = (columns[..., :2] - middle[:, None]).unbind(2)  # (B,D) from the tile's middle
+    a, b, c, opacity = columns[..., 2:6].unbind(2)  # (B,D)
     slope_x = a * x + b * y
     slope_y = b * x + c * y
     at_middle = torch.log(opacity + 1e-12) - (slope_x * x + slope_y * y) / 2
@@ -3523,7 +3225,7 @@ def splat(center, cov, opacity, rgb, xy):
     alpha = log_alpha.clamp(max=-1e-3).exp()
     w, trans = geonvs.composite(alpha.flatten(0, 1))  # (BP,D), (BP,)
     w = w.unflatten(0, (-1, P))
-    picture = w @ columns[:, :, 6:]  # (B,P,3)
+    picture = w @ columns[..., 6:]  # (B,P,3)
     which = of_ray * P + place  # (R,)
     return picture.flatten(0, 1)[which], trans[which]
 
@@ -3538,8 +3240,7 @@ class Splats(Rival):
     def make_parts(self, cfg, scene):
         radius = scene.points.norm(dim=1).max().clamp(min=3)
         sky = F.normalize(torch.randn(SHELL, 3))
-        shell = 2 * radius * sky
-        center = torch.cat([scene.points, shell])  # (N,3)
+        center = torch.cat([scene.points, 2 * radius * sky])  # (N,3)
         gaps = []
         for some in center.split(1024):
             nearest, _ = torch.cdist(some, center).topk(4, largest=False)
@@ -3548,8 +3249,7 @@ class Splats(Rival):
         N = len(center)
         self.center = nn.Parameter(center)
         self.log_size = nn.Parameter(size.log().repeat(1, 3))
-        no_turn = torch.tensor([1.0, 0, 0, 0])
-        self.turn = nn.Parameter(no_turn.repeat(N, 1))
+        self.turn = nn.Parameter(torch.tensor([1.0, 0, 0, 0]).repeat(N, 1))
         self.opacity = nn.Parameter(torch.zeros(N))
         self.feature = nn.Parameter(0.1 * torch.randn(N + 1, FEATURE))  # the last one of the sky
         self.paint = geonvs.mlp(FEATURE + cfg.appearance_dim, cfg.hidden, 3)
@@ -3558,14 +3258,15 @@ class Splats(Rival):
         self.views = {}  # by photo
 
     def groups(self):
-        return [
-            dict(params=[self.center], lr=2e-3),
-            dict(params=[self.log_size], lr=5e-2),
-            dict(params=[self.turn], lr=2e-2),
-            dict(params=[self.opacity], lr=5e-2),
-            dict(params=[self.feature], lr=2e-2),
-            dict(params=list(self.paint.parameters()), lr=2e-3),
-            dict(params=[self.appearance.weight], lr=self.cfg.lr_code)]
+        rates = [
+            ([self.center], 2e-3),
+            ([self.log_size], 5e-2),
+            ([self.turn], 2e-2),
+            ([self.opacity], 5e-2),
+            ([self.feature], 2e-2),
+            (list(self.paint.parameters()), 2e-3),
+            ([self.appearance.weight], self.cfg.lr_code)]
+        return [dict(params=parameters, lr=rate) for parameters, rate in rates]
 
     def render(self, rays, code):
         """rgb (R,3); the rays of each photo at once, under the code of the first of them. The
@@ -3575,10 +3276,9 @@ class Splats(Rival):
             if photo not in self.views:
                 with torch.no_grad():
                     self.views[photo] = self.view(photo)
-            mine = (rays.img == photo).nonzero()[:, 0]
+            mine = rays.img == photo  # (R,)
             xy = rays.uv[mine] * self.scene.wh[photo]  # px
-            picture = self.draw(self.views[photo], code[mine[0]], xy)
-            rgb = rgb.index_put((mine,), picture)
+            rgb[mine] = self.draw(self.views[photo], code[mine][0], xy)
         return dict(rgb=rgb, normal=torch.zeros_like(rgb))
 
     def view(self, photo):
@@ -3618,7 +3318,7 @@ class Splats(Rival):
         code = self.appearance.weight[photo]
         rgb = self.draw(self.view(photo), code, xy)
         loss = (rgb - rays.rgb).abs().mean()
-        return loss, dict(rgb=loss), dict(rgb=rgb)
+        return loss, dict(rgb=loss), {}
 
 
 # ---- What rows replace: the printed or the plainer form of a piece -------------------------------
@@ -3746,12 +3446,11 @@ STRESS = {  # knobs of the toy, the row of PIECES that is made for them, seeds
     "few photos": (dict(photos=8), "no SfM term", 3),
     "wrong poses": (dict(photos=24, pose_noise=3.0), "no curvature", 3),
     "other building": (dict(photos=24, landmark=3), "no curvature", 1)}
+WIDE = dict(rays=1024, samples=64, hidden=256, lr_net=5e-4)
 PUBLISHED = {
     geonvs.GeoNVS: {},
-    NeRFW: dict(
-        rays=1024, photos=1024, samples=64, hidden=256, lr_net=5e-4),
-    HaNeRF: dict(
-        rays=1024, photos=1, samples=64, hidden=256, lr_net=5e-4),
+    NeRFW: WIDE | dict(photos=1024),
+    HaNeRF: WIDE | dict(photos=1),
     Splats: SPLATS}
 SMALL = {  # what serves the toy best
     geonvs.GeoNVS: dict(rays=384, hidden=32, lr_net=1e-2, lr_grid=3e-2),
@@ -3820,8 +3519,7 @@ def run_row(run, given, row):
     saved = json.loads(path.read_text()) if path.exists() else {}
     if saved.get("key") != key:
         saved = dict(key=key, metrics=train_row(cfg, arrays, run, row))
-        text = json.dumps(saved)
-        data_prep.atomic_write(path, lambda part: part.write_text(text))
+        data_prep.atomic_write(path, lambda part: part.write_text(json.dumps(saved)))
     metrics = saved["metrics"]
     result = metrics.get("failed") or "{psnr:.2f} dB, {train_seconds:.0f} s".format(**metrics)
     print(f"{run}: {result}", flush=True)
@@ -3832,11 +3530,8 @@ def train_row(cfg, arrays, run, row):
     """Trains and scores, with what the row replaces; writes log.txt below run."""
     run.mkdir(parents=True, exist_ok=True)
     scene = geonvs.load_scene(arrays, geonvs.pick_device(cfg.device))
-    with contextlib.ExitStack() as stack:
-        for name, value in row.replaced.items():
-            stack.enter_context(mock.patch.object(geonvs, name, value))
-        log = stack.enter_context(open(run / "log.txt", "w"))
-        stack.enter_context(contextlib.redirect_stdout(log))
+    replaced = mock.patch.dict(vars(geonvs), row.replaced)
+    with replaced, open(run / "log.txt", "w") as log, contextlib.redirect_stdout(log):
         try:
             return geonvs.execute(cfg, scene, run, kind=row.kind)
         except UserError as error:
