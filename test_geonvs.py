@@ -1133,6 +1133,14 @@ def test_promised_counts_are_noticed_before_memory_is_taken(damaged):
             assert size < 2 ** 21
 
 
+def test_a_truncated_model_is_refused_and_one_with_flipped_bits_does_no_harm(damaged):
+    _, data, read = damaged
+    rng = np.random.default_rng(0)
+    for n in range(0, len(data), 31):
+        assert read(data[:n]) is None
+        read(flipped(data, rng, low=0))
+
+
 # ---- downloads -----------------------------------------------------------------------------------
 def archive(members):
     """A .tar.gz of (name, bytes of a file or aim of a link)."""
