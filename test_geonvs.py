@@ -2035,6 +2035,11 @@ def test_mixed_precision_leaves_the_sdf_alone(warm, monkeypatch):
     assert mixed != full
     for name in ("opacity", "depth", "e_grad", "e_curv"):
         assert torch.equal(mixed_out[name], out[name])
+    wanted = gradients(warm, full)
+    for name, grad in gradients(warm, mixed).items():
+        if name.startswith("sdf"):
+            assert grad.dtype == torch.float32
+            assert (grad - wanted[name]).norm() < 0.05 * wanted[name].norm()
 
 
 class OneDevice(TorchDispatchMode):
@@ -2061,23 +2066,51 @@ def to_meta(value):
     return value.to("meta") if torch.is_tensor(value) else value
 
 
-@pytest.mark.parametrize("mask", ["on", "off"])
-@pytest.mark.parametrize("parts", ["on", "off"])
-def test_a_step_stays_on_its_device_and_asks_it_for_no_value(scene, monkeypatch, parts, mask):
+def train_on_meta(model, monkeypatch):
+    """Takes steps on a device that has no values to be asked for."""
     monkeypatch.setattr(adam, "_device_dtype_check_for_fused", lambda *args, **kwargs: None)
-    model = make_model(scene, appearance=parts, background=parts, mask=mask)
-    model.scene = geonvs.Scene(*map(to_meta, scene))
+    photos = to_meta(model.scene.photos(False))
+    model.scene = geonvs.Scene(*map(to_meta, model.scene))
     model.to("meta")
     for module in model.modules():
         for name, value in vars(module).items():
             setattr(module, name, to_meta(value))
     optimizer = geonvs.make_optimizer(model)
-    photos = to_meta(scene.photos(False))
     gen = MetaGenerator()
     with OneDevice():
         for step in (7, 8):
             terms = geonvs.training_step(model, optimizer, photos, step, 0.1, gen)
+    return terms
+
+
+@pytest.mark.parametrize("mask", ["on", "off"])
+@pytest.mark.parametrize("parts", ["on", "off"])
+def test_a_step_stays_on_its_device_and_asks_it_for_no_value(scene, monkeypatch, parts, mask):
+    model = make_model(scene, appearance=parts, background=parts, mask=mask)
+    terms = train_on_meta(model, monkeypatch)
     assert all(value.device.type == "meta" for value in terms.values())
+
+
+def host_index(mask, rays):
+    return mask.static[torch.zeros(64, dtype=torch.long), 0, 0]
+
+
+def asked_value(mask, phi):
+    return phi.mean() if mask.sum() > 0 else mask.mean()
+
+
+def host_constant(e_grad, e_curv):
+    return e_grad * torch.tensor(10.0).to(e_grad.device) + e_curv
+
+
+@pytest.mark.parametrize("place, name, fault", [
+    (geonvs.TransientMask, "is_static", host_index),
+    (geonvs, "gpl_loss", asked_value),
+    (geonvs, "complexity", host_constant)])
+def test_the_stand_in_for_a_gpu_catches_planted_faults(warm, monkeypatch, place, name, fault):
+    monkeypatch.setattr(place, name, fault)
+    with pytest.raises(RuntimeError):
+        train_on_meta(warm, monkeypatch)
 
 
 # ---- 1 settings ----------------------------------------------------------------------------------
@@ -2302,15 +2335,47 @@ def test_a_run_begins_anew_and_follows_its_seed(scene, tmp_path):
     assert not (tmp_path / "film.mp4").exists()
 
 
-def test_a_resumed_run_ends_bit_for_bit_like_the_uninterrupted_one(scene, tmp_path, monkeypatch):
+def start_child(function, folder, **env):
+    """A new process that calls a function of this file in a folder."""
+    path = [str(Path(part).resolve()) for part in sys.path]
+    module = Path(__file__).stem
+    code = f"import sys; sys.path[:0] = {path}; import {module}; {module}.{function}()"
+    return subprocess.Popen(
+        [sys.executable, "-c", code],
+        cwd=folder,
+        env=os.environ | env,
+        text=True,
+        stdout=subprocess.PIPE)
+
+
+def train_until_killed():
+    """Trains five steps of eight, with a checkpoint at each."""
+    patch = pytest.MonkeyPatch()
+    pass_time(patch, seconds=100)
+    step = geonvs.training_step
+
+    def step_or_die(*args):
+        if args[3] == 5:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return step(*args)
+    patch.setattr(geonvs, "training_step", step_or_die)
+    run_training(geonvs.load_scene(toy()), Path(), steps=8)
+
+
+def test_a_run_resumed_after_sigkill_ends_bit_for_bit_like_the_uninterrupted_one(
+        scene, tmp_path, monkeypatch):
+    process = start_child("train_until_killed", tmp_path)
+    process.communicate(timeout=120)
     pass_time(monkeypatch, seconds=100)
-    saved = train_until(5, scene, tmp_path, steps=8)
+    saved = read_saved(tmp_path)
     cfg = geonvs.Config(**saved["config"])
     resumed, _ = geonvs.train(cfg, scene, tmp_path, saved)
     whole, _ = run_training(scene, tmp_path / "whole", steps=8)
+    assert process.returncode == -signal.SIGKILL
+    assert saved["state"]["step"] == 5
     assert_same_tensors(resumed.state_dict(), whole.state_dict())
     assert resumed.cfg == whole.cfg
-    assert read_log(tmp_path) == read_log(tmp_path / "whole")
+    assert read_log(tmp_path)[-1] == read_log(tmp_path / "whole")[-1]
 
 
 def test_resuming_adds_time_and_energy_to_what_was_spent(scene, tmp_path, loop, monkeypatch):
@@ -2429,18 +2494,8 @@ def test_two_processes_train_one_model_on_the_rays_of_both(tmp_path):
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = str(free.getsockname()[1])
-    path = [str(Path(part).resolve()) for part in sys.path]
-    module = Path(__file__).stem
-    code = f"import sys; sys.path[:0] = {path}; import {module}; {module}.train_as_one_of_two()"
-    env = os.environ | dict(MASTER_ADDR="127.0.0.1", MASTER_PORT=port, WORLD_SIZE="2")
-    pair = []
-    for rank in "01":
-        pair.append(subprocess.Popen(
-            [sys.executable, "-c", code],
-            cwd=tmp_path,
-            env=env | dict(RANK=rank),
-            text=True,
-            stdout=subprocess.PIPE))
+    env = dict(MASTER_ADDR="127.0.0.1", MASTER_PORT=port, WORLD_SIZE="2")
+    pair = [start_child("train_as_one_of_two", tmp_path, RANK=rank, **env) for rank in "01"]
     said, silence = [process.communicate(timeout=120)[0] for process in pair]
     assert "step 16" in said
     assert silence == ""
