@@ -2366,13 +2366,13 @@ def test_a_run_resumed_after_sigkill_ends_bit_for_bit_like_the_uninterrupted_one
         scene, tmp_path, monkeypatch):
     process = start_child("train_until_killed", tmp_path)
     process.communicate(timeout=120)
-    pass_time(monkeypatch, seconds=100)
+    assert process.returncode == -signal.SIGKILL
     saved = read_saved(tmp_path)
+    assert saved["state"]["step"] == 5
+    pass_time(monkeypatch, seconds=100)
     cfg = geonvs.Config(**saved["config"])
     resumed, _ = geonvs.train(cfg, scene, tmp_path, saved)
     whole, _ = run_training(scene, tmp_path / "whole", steps=8)
-    assert process.returncode == -signal.SIGKILL
-    assert saved["state"]["step"] == 5
     assert_same_tensors(resumed.state_dict(), whole.state_dict())
     assert resumed.cfg == whole.cfg
     assert read_log(tmp_path)[-1] == read_log(tmp_path / "whole")[-1]
