@@ -49,8 +49,8 @@ Where the printed paper is departed from, the line carries its tag:
   [D13] derivatives are differences between four taps, around the ray's end and, on every second
         ray, around a random sample; all samples give the colour network the normal of the end
   [D14] zeta stays above a rising floor, so that no surface stays fog, and below a fixed bound
-  [D15] cells split where colours err and merge far from surfaces; a scene that needs no codes, no
-        mask or no background field is modelled without
+  [D15] cells split where colours err; a scene that needs no codes, no mask or no background field
+        is modelled without
 """
 import argparse
 import io
@@ -297,9 +297,9 @@ def grid_index(n, device):
 class Octree(nn.Module):
     """Feature grid over the cube [-half, half]^3 that is fine only where it has been split. Level
     0 is a dense grid of root^3 cells. Features live on corners, shared by the cells that meet
-    there. A corner that lacks one of its cells ("hanging") has the weight 0, so the field is
-    continuous across borders of refined regions. At a place where a level has no cell, the
-    features of that level are 0."""
+    there. A corner that lacks one of its eight cells ("hanging") has the weight 0, so the field is
+    continuous across borders of refined regions, and 0 on the cube's faces. At a place where a
+    level has no cell, the features of that level are 0."""
     def __init__(self, half, levels, channels=4, root=ROOT):
         super().__init__()
         self.half = half
@@ -327,8 +327,8 @@ class Octree(nn.Module):
         return self.key(self.cells[self.child > 0])
 
     def split(self, cells):
-        """Splits cells (...,4); the function stays, as new features are zero."""
-        self.build(torch.cat([self.split_keys, self.key(cells).flatten()]))
+        """Splits cells (...,4); the function stays, as new features are zero. See build."""
+        return self.build(torch.cat([self.split_keys, self.key(cells).flatten()]))
 
     def build(self, split_keys):
         """Makes cells and corners from the keys of the cells that are split. New features are
@@ -355,10 +355,7 @@ class Octree(nn.Module):
         corners = self.cells[:, None] + F.pad(octants, (1, 0))  # (N,8,4)
         key = self.key(corners)  # (N,8)
         _, number, cells_around = key.unique(return_inverse=True, return_counts=True)
-        last = self.root << self.cells[:, :1, None]  # (N,1,1) index on the cube's far faces
-        index = corners[:, :, 1:]
-        is_within = (index > 0) & (index < last)  # (N,8,3)
-        self.is_free = cells_around[number] == 2 ** is_within.sum(2)  # (N,8)
+        self.is_free = cells_around[number] == 8  # (N,8)
         old_key = self.corner_key
         self.corner_key = key[self.is_free].unique()  # (V,)
         self.corner = nearest_row(self.corner_key, key).int()  # (N,8) any row, where hanging
@@ -430,32 +427,21 @@ def seed_octree(octree, points, dense, near):
 
 
 ERROR_SHARE = 0.8  # of the error at the surface lies in the cells that are split
-HIDDEN = 6.0  # zeta |s| from where on the field is hardly seen: sigmoid(-6) = 0.0025
 
 
 @torch.no_grad()
-def refined_keys(octree, sdf, zeta):
-    """Keys of the cells that should be split. sdf: (P,3) to (P,). Of the cells at the surface whose
-    children are no finer than a pixel, the worst are split: those that hold most of the error
-    recorded there. A cell is merged if |s| says that no visible wall is near. [D15]"""
+def worst_cells(octree):
+    """The cells (N,4) that should be split: of those whose children are no finer than a pixel, the
+    worst, which hold most of the error recorded in octree.ends. [D15]"""
     level = octree.cells[:, 0]  # (N,)
-    side = octree.side(level)
-    index = octree.cells[:, 1:]  # (N,3)
-    centre = (index + 0.5) * side[:, None] - octree.half
-    s = in_chunks(sdf, centre).abs()  # (N,)
-    reach = 1.87 * side  # half a cell's diagonal, and a cell
-    is_split = octree.child > 0
-    error, pixel, count = octree.ends.unbind(1)  # (N,) sums
-    can_split = (s < reach) & ~is_split & (level < octree.levels - 1)
-    is_coarse = pixel < count * side / 2  # mean size of a pixel under a child's side
-    error = error * (can_split & is_coarse)
-    enough = ERROR_SHARE * error.sum()
-    error, worst = error.sort(descending=True)  # (N,)
+    error, pixel, count = octree.ends.unbind(1)  # (N,) sums over rays that ended there
+    is_coarse = pixel < count * octree.side(level) / 2  # mean size of a pixel under a child's side
+    can_split = is_coarse & (octree.child == 0) & (level < octree.levels - 1)
+    error, worst = (error * can_split).sort(descending=True)  # (N,)
     before = error.cumsum(0) - error  # (N,) what worse cells hold
+    is_chosen = before < ERROR_SHARE * error.sum()
     room = max(0, MAX_CELLS - len(level)) // 8
-    is_split &= s < reach + HIDDEN / zeta
-    is_split[worst[before < enough][:room]] = True
-    return octree.key(octree.cells[is_split])
+    return octree.cells[worst[is_chosen][:room]]
 
 
 # ---- 4 Fields: the networks on top of the octree -------------------------------------------------
@@ -525,10 +511,11 @@ class SDFField(nn.Module):
         return sdf, torch.cat([geo, feat], 1)
 
     def derivatives(self, x, eps):
-        """grad s (P,3) and lap s (P,) at x (P,3), from s there and at four taps, eps away."""
+        """s (P,), grad s (P,3) and lap s (P,) at x (P,3), from s there and at four taps, eps away."""
         points = x[:, None] + eps * self.taps  # (P,5,3)
         sdf, _ = self(points.flatten(0, 1))
-        return finite_differences(sdf.reshape(-1, 5), self.taps, eps)
+        sdf = sdf.reshape(-1, 5)
+        return sdf[:, 0], *finite_differences(sdf, self.taps, eps)
 
 
 class LipschitzLinear(nn.Linear):
@@ -654,13 +641,13 @@ class Background(nn.Module):
     def __init__(self, points, hidden, per_ray, levels):
         super().__init__()
         self.octree = Octree(2.0, levels, root=32)
-        seed_octree(self.octree, contract(points), dense=0, near=levels - 1)  # SfM points (K,3)
+        seed_octree(self.octree, contract(points), dense=levels - 3, near=2)  # SfM points (K,3)
         self.density = mlp(3 + self.octree.width, hidden, 1 + GEO)
         self.color = mlp(GEO + per_ray, hidden, 3)
 
     def forward(self, rays, t0, t1, per_ray, jitter):
         """Returns front (R,3), the colour before t0 (R,1); passes (R,1), the light that front lets
-        through; behind (R,3), the colour beyond t1 (R,1), dimmed by front. per_ray: (R,9+A)
+        through; behind (R,3), the colour beyond t1 (R,1), dimmed by front. per_ray: (R,3+A)
         direction and code; jitter (R,S) in 0..1, here S background samples. A sixth of them lies
         evenly before the sphere; the others are even in u, at a distance u / (1 - u) behind it.
         The last is opaque. [D8]"""
@@ -676,7 +663,7 @@ class Background(nn.Module):
         inputs = torch.cat([x, self.octree(x)], 1)  # (RS,3+LC)
         out = mixed_precision(self.density, inputs)  # (RS,1+GEO)
         density, geo = out.split([1, GEO], 1)
-        inputs = torch.cat([geo, per_ray.repeat_interleave(S, 0)], 1)  # (RS,GEO+9+A)
+        inputs = torch.cat([geo, per_ray.repeat_interleave(S, 0)], 1)  # (RS,GEO+3+A)
         rgb = mixed_precision(self.color, inputs).sigmoid()
         rgb = rgb.reshape(R, S, 3)
         sigma = F.softplus(density.reshape(R, S) - 1)
@@ -688,12 +675,6 @@ class Background(nn.Module):
         front, behind = colors.split([n, S - n], 1)
         passes = 1 - w[:, :n].sum(1, keepdim=True)
         return front.sum(1), passes, behind.sum(1)
-
-
-def direction_code(d):
-    """Polynomials (R,9) of d (R,3), which span the spherical harmonics up to degree 2."""
-    mixed = d * d.roll(1, 1)
-    return torch.cat([d, d * d, mixed], 1)
 
 
 def render_rays(model, rays, code, jitter):
@@ -718,13 +699,13 @@ def render_rays(model, rays, code, jitter):
     depth = (w * t).sum(1) + trans * t1[:, 0]
     depth = depth.detach()  # (R,)
     end = rays.at(depth[:, None])[:, 0]  # (R,3)
-    grad, lap = model.sdf.derivatives(end, model.eps)  # (R,3), (R,)
+    _, grad, lap = model.sdf.derivatives(end, model.eps)  # (R,3), (R,)
     normal = F.normalize(grad)
 
-    per_ray = torch.cat([direction_code(rays.d), code], 1)  # (R,9+A)
-    constants = torch.cat([normal, per_ray], 1)  # (R,3+9+A) the same for all samples of a ray [D13]
+    per_ray = torch.cat([rays.d, code], 1)  # (R,3+A)
+    constants = torch.cat([normal, per_ray], 1)  # (R,3+3+A) the same for all samples of a ray [D13]
     constants = constants.repeat_interleave(S + 1, 0)
-    inputs = torch.cat([geo, constants], 1)  # (R(S+1),G+3+9+A)
+    inputs = torch.cat([geo, constants], 1)  # (R(S+1),G+3+3+A)
     rgb = mixed_precision(model.color, inputs).sigmoid()
     rgb = rgb.reshape(-1, S + 1, 3)
     rgb = torch.einsum("rs,rsc->rc", w, rgb)  # (R,3)
@@ -923,10 +904,10 @@ class GeoNVS(nn.Module):
         is_inside = scene.points.norm(dim=1) < 1
         self.sfm = scene.points[is_inside]  # (K,3)
         octree = Octree(1.0, levels)
-        seed_octree(octree, self.sfm, dense=1, near=1)
+        seed_octree(octree, self.sfm, dense=0, near=2)
         self.sdf = SDFField(octree, cfg.hidden)
         self.color = nn.Sequential(
-            LipschitzLinear(GEO + octree.width + 3 + 9 + A, cfg.hidden),
+            LipschitzLinear(GEO + octree.width + 3 + 3 + A, cfg.hidden),
             nn.ReLU(),
             LipschitzLinear(cfg.hidden, cfg.hidden),
             nn.ReLU(),
@@ -940,7 +921,7 @@ class GeoNVS(nn.Module):
         has_colors = np.isnan(raw["bg_color"]).any()  # nan: it has no one colour
         if is_on(cfg.background, has_colors):
             points = scene.points[~is_inside]
-            self.background = Background(points, cfg.hidden, 9 + A, min(levels, 4))
+            self.background = Background(points, cfg.hidden, 3 + A, min(levels, 4))
             self.octrees.append(self.background.octree)
         self.deviation = Deviation()
         self.mask = TransientMask(scene)
@@ -985,16 +966,15 @@ class GeoNVS(nn.Module):
 
         which = random_index(gen, cfg.samples + 1, R)
         t = out["t"].gather(1, which[:, None])  # (R,1)
-        sample = rays.at(t)[::2]  # (N,1,3) a random one of every second ray [D13]
-        N = len(sample)
-        taps = sample + self.eps * self.sdf.taps  # (N,5,3)
-        sfm = self.sfm[random_index(gen, len(self.sfm), N)]
-        points = torch.cat([taps.flatten(0, 1), sfm])
-        s_taps, s_sfm = self.distance(points).split([5 * N, N])
-        grad, _ = finite_differences(s_taps.reshape(N, 5), self.sdf.taps, self.eps)
+        sample = rays.at(t)[::2, 0]  # (N,3) a random one of every second ray [D13]
+        sfm = self.sfm[random_index(gen, len(self.sfm), len(sample))]  # (N,3)
+        s, grad, _ = self.sdf.derivatives(torch.cat([sample, sfm]), self.eps)
+        grad, _ = grad.chunk(2)  # (N,3) of the samples
+        _, s_sfm = s.chunk(2)  # (N,) of the SfM points
         pull = self.deviation().detach().clamp(max=40)  # [D10]
 
         terms = dict(
+            mse=residual.detach().square().mean(),  # for the log
             rgb=((1 - mask) * residual.mean(1)).mean(),
             eik=(out["e_grad"].mean() + eikonal(grad).mean()) / 2,
             curv=out["e_curv"].mean(),  # [D4]
@@ -1040,40 +1020,36 @@ class GeoNVS(nn.Module):
         return random_rays(self.scene, img, gen), picked
 
     def groups(self):
-        """Optimiser groups: networks; features and codes, which learn faster; zeta, whose larger
-        eps keeps vanishing gradients from driving it away; the mask."""
+        """Optimiser groups: networks; octree features, codes and the mask, which learn faster."""
         grids = [octree.features for octree in self.octrees]
         codes = [self.appearance.weight]
         mask = list(self.mask.parameters())
-        zeta = [self.deviation.v]
-        special = set(grids + codes + mask + zeta)
+        special = set(grids + codes + mask)
         networks = [p for p in self.parameters() if p not in special]
         return [
             dict(params=networks, lr=self.cfg.lr_net),
             dict(params=grids, lr=self.cfg.lr_grid),
             dict(params=codes, lr=self.cfg.lr_code),
-            dict(params=zeta, lr=1e-3, eps=1e-8),
             dict(params=mask, lr=8e-3)]
 
     def refine(self, optimizer):
-        """Splits and merges cells; Adam's moments move along with their features. [D15]"""
+        """Splits cells where colours err; Adam's moments move along with their features. [D15]"""
         octree = self.sdf.octree
-        keys = refined_keys(octree, self.distance, self.deviation().item())
+        cells = from_first_process(worst_cells(octree).cpu())
         state = optimizer.state.pop(octree.features)
-        old_row = octree.build(from_first_process(keys.cpu()).to(keys.device))
+        old_row = octree.split(cells.to(octree.cells.device))
         for name in ("exp_avg", "exp_avg_sq"):
             state[name] = carry_rows(state[name], old_row)
         optimizer.state[octree.features] = state
-        for group, fresh in zip(optimizer.param_groups, self.groups()):
-            group["params"] = fresh["params"]
+        _, grids, *_ = optimizer.param_groups
+        grids["params"][0] = octree.features
 
     @torch.no_grad()
     def decide_mask(self):
-        """--mask auto: off if M marks hardly anything in the training photos. [D15]"""
+        """--mask auto: off if M marks hardly anything in 64 training photos. [D15]"""
         if self.cfg.mask == "auto":
-            photos = self.scene.photos(False)
-            logits = [self.mask.logits(some) for some in photos.split(32)]
-            share = torch.cat(logits).sigmoid().mean().item()
+            photos = self.scene.photos(False)[:64]
+            share = self.mask.logits(photos).sigmoid().mean().item()
             is_needed = from_first_process(share > 0.01)
             self.cfg.mask = "on" if is_needed else "off"
             print(f"  mean mask {share:.4f}: mask {self.cfg.mask}")
@@ -1284,21 +1260,16 @@ def train(cfg, scene, run, saved=None, kind=GeoNVS):
         state["step"] += 1
 
 
-@torch.no_grad()
 def report(model, path, done, state, terms):
-    """A line on the terminal and one in log.jsonl. psnr: of about 1,024 fixed rays."""
+    """A line on the terminal and one in log.jsonl. psnr: of the step's rays, people included."""
     is_sound = all(p.isfinite().all() for p in model.parameters())
     check(is_sound, "the loss is no longer finite: mend poses, or try a third of the learning "
           f"rates --lr_grid and --lr_net; checkpoint.pt beside {path} is from before")
-    gen = torch.Generator(model.scene.c2w.device).manual_seed(0)
-    count = max(1024, model.cfg.photos)
-    rays, _ = model.batch(model.scene.photos(False), count, gen)
-    out = model.render(rays, model.codes()[rays.img])
-    numbers = {key: float(value) for key, value in terms.items()}
-    line = state | numbers | dict(psnr=psnr(out["rgb"], rays.rgb))
+    numbers = {key: value.item() for key, value in terms.items()}
+    numbers["psnr"] = -10 * math.log10(numbers["mse"])
     with open(path, "a") as file:
-        print(json.dumps(line), file=file)
-    print(f"  {done:4.0%}  step {state['step']}  psnr {line['psnr']:.2f}", flush=True)
+        print(json.dumps(state | numbers), file=file)
+    print(f"  {done:4.0%}  step {state['step']}  psnr {numbers['psnr']:.2f}", flush=True)
 
 
 # ---- 10 Scoring, mesh, pictures ------------------------------------------------------------------
@@ -1361,10 +1332,10 @@ def photo_rays(scene, photo):
 def render_photo(model, scene, photo, code):
     """A photo's view under an appearance code (A,): rgb, truth and normal (H,W,3)."""
     w, h = scene.wh[photo].tolist()
+    columns = [column.split(1024) for column in photo_rays(scene, photo)]
     parts = []
-    for pixel in torch.arange(w * h, device=code.device).split(1024):
-        rays = make_rays(scene, torch.full_like(pixel, photo), pixel)
-        out = model.render(rays, code.expand(len(pixel), -1))
+    for rays in map(Rays, *columns):
+        out = model.render(rays, code.expand(len(rays.o), -1))
         parts.append(torch.cat([out["rgb"], rays.rgb, out["normal"]], 1))  # (R,9)
     picture = torch.cat(parts).reshape(h, w, 9)
     rgb, truth, normal = np.split(picture.cpu().numpy(), 3, axis=2)
@@ -1432,7 +1403,7 @@ def toy_truth(model, scene):
     names = ("near_wall", "near_wall_sdf", "wall", "wall_normal")
     near, sdf, wall, normal = [torch.as_tensor(raw[name]).to(scene.c2w) for name in names]
     error = (in_chunks(model.distance, near) - sdf).abs()
-    grad, _ = model.sdf.derivatives(wall, 0.004)
+    _, grad, _ = model.sdf.derivatives(wall, 0.004)
     cos = F.cosine_similarity(grad, normal).clamp(-1, 1)
     truth = dict(
         sdf_error=error.mean().item(),
@@ -1484,11 +1455,11 @@ def extract_mesh(model):
 
 def surface_color(model, x):
     """Colours (P,3) of surface points (P,3), seen along their normals under the mean code."""
-    grad, _ = model.sdf.derivatives(x, model.eps)
+    _, grad, _ = model.sdf.derivatives(x, model.eps)
     normal = F.normalize(grad)
     code = mean_code(model).expand(len(x), -1)
     _, geo = model.sdf(x)
-    inputs = torch.cat([geo, normal, direction_code(-normal), code], 1)
+    inputs = torch.cat([geo, normal, -normal, code], 1)
     return model.color(inputs).sigmoid()
 
 
@@ -1584,32 +1555,25 @@ def finish(model, scene, state, run):
     return metrics
 
 
-def in_between(keys, n):
-    """n rows (n,D) evenly along the polyline through keys (B,D)."""
-    at = torch.linspace(0, len(keys) - 1, n, device=keys.device)
-    left = keys[at.long()]
-    right = keys[at.ceil().long()]
-    return torch.lerp(left, right, at.frac()[:, None])
-
-
-def film(model, scene, path):
+def film(model, scene, path, frames=96):
     """mp4 at 24 frames/s: the first training camera sways sideways, by a tenth of the sphere's
-    radius, while the light goes from photo to photo."""
-    photos = scene.photos(False)
-    stops = photos[::math.ceil(len(photos) / 7)]
-    codes = in_between(model.codes()[stops], 24 * len(stops))  # (n,A)
+    radius, while its photo's light turns into the last photo's."""
+    photos = scene.photos(False)[[0, -1]]
+    first, last = model.codes()[photos]  # (A,)
     photo = photos[0].item()
-    position = scene.c2w[photo, :, 3]
     scene = scene._replace(c2w=scene.c2w.clone())
     camera = scene.c2w[photo]  # (3,4), a part of the copy
+    position = camera[:, 3].clone()
     w, h = (scene.wh[photo] // 2 * 2).tolist()  # codecs want even sides
 
     def write(part):
         codec = cv2.VideoWriter_fourcc(*"mp4v")
         video = cv2.VideoWriter(str(part), codec, 24, (w, h))
-        for n, code in enumerate(progress(codes, f"filming {len(codes)} frames")):
-            camera[:, 3] = position + 0.1 * math.sin(n / 24) * camera[:, 0]
-            frame = render_photo(model, scene, photo, code)
+        for n in progress(range(frames), f"filming {frames} frames"):
+            share = n / (frames - 1)
+            sway = 0.1 * math.sin(2 * math.pi * share)
+            camera[:, 3] = position + sway * camera[:, 0]
+            frame = render_photo(model, scene, photo, torch.lerp(first, last, share))
             video.write(to_uint8(frame["rgb"][:h, :w, ::-1]))
         video.release()
         return part.stat().st_size > 0
