@@ -11,7 +11,7 @@ follow one ray from its pixel to the loss; the training loop comes after them.
     python geonvs.py --help                every setting with its meaning and default
 
 Conventions
-  world     the foreground is the unit sphere; x_file = x * scale + center leads back to SfM units
+  world     the foreground is the unit sphere; x * scale + center leads back to SfM units
   cameras   c2w (3,4) camera to world, OpenCV axes: x right, y down, z forward; pixel centres +0.5
   rays      r(t) = o + t d with |d| = 1, so t is a distance along the ray and not a z-depth
   sdf       positive outside; the normal is the unit gradient; colours are sRGB in [0, 1]
@@ -22,7 +22,7 @@ Conventions
             octree levels, C channels per level, V rows of features, H hidden width, G what colour
             is read from, A appearance dims, B photos of all I, K SfM points, T sightings of them
 
-Where the printed paper is departed from, the line carries its tag:
+Departures from the printed paper; their tags stand in the code, or in the docstring above it:
   [D1]  alpha is divided by sigmoid(zeta s_i) and never negative (printed: a wall is 63 % opaque)
   [D2]  alpha has no beta: s is evaluated at both ends of a section, so no slope has to be guessed;
         a section has the mean colour of its ends
@@ -34,23 +34,23 @@ Where the printed paper is departed from, the line carries its tag:
   [D5]  the Lipschitz term is a sum of logs, not a product that can drown the colour at first
   [D6]  CGNet is small and sees small square photos: one plain block a stage, GroupNorm, ReLU
   [D7]  M is learnt by classification. A ray is transient if its error (of the worst channel)
-        exceeds its price, which is
-        max(upper quartile of errors at SfM pixels + lam_mask, 0.15) + lam_gpl Phi. There is no
-        term for bimodality. M is taught in the first 60 % of training; in the first 30 % a ray
-        above its price that M suspects teaches no colours
+        exceeds the price of masking it,
+        max(upper quartile of errors at SfM pixels + lam_mask, 0.15) + lam_gpl Phi; a lesson weighs
+        as much as the two differ. There is no term for bimodality. M is taught in the first 60 %
+        of training; in the first 30 % a ray above its price that M suspects teaches no colours
   [D8]  the background also fills what lies before the sphere; its last section is opaque
   [D9]  only the colour and background networks have mixed precision: distances stay float32 (the
         mask's convolutions may use TF32)
   [D10] SfM points place the sphere, seed the octree, teach M = 0 and pull s(p) to zero, but less
         while zeta is below 40: a strong pull would leave the surface fog. There is no off-surface
-        penalty, as trials were as good without, and no warm-up: s starts as a small sphere
+        penalty, as trials were as good without, and no sphere loss: s starts as a small sphere
   [D11] samples are drawn from a cached SDF volume; no second network pass along the ray
   [D12] a test photo's code is fitted on its left half, its score is taken on the right half
-  [D13] derivatives are differences between four taps, around the ray's end and, on every second
-        ray, around a random sample; all samples give the colour network the normal of the end
+  [D13] derivatives are taken at the ray's end and, on every second ray, at a random sample, not
+        at all samples, which share the normal of the end in the colour network
   [D14] zeta stays above a rising floor, so that no surface stays fog, and below a fixed bound
-  [D15] cells split where colours err; a scene that needs no codes, no mask or no background field
-        is modelled without
+  [D15] cells split where colours err, and stay (the paper prunes empty space); a scene that needs
+        no codes, no mask or no background field is modelled without
 """
 import argparse
 import io
@@ -87,7 +87,7 @@ def opt(default, text, *choices):
     return field(default=default, metadata=dict(help=text, choices=choices or None))
 
 
-AT_LEAST = dict(
+AT_LEAST = dict(  # 0 for other settings
     steps=1,
     downscale=1,
     rays=2,
@@ -100,7 +100,7 @@ AT_LEAST = dict(
 @dataclass
 class Config:
     """All settings. Of these defaults lam_gpl alone is the paper's."""
-    scene: str = opt("toy", "synthetic, or of Phototourism", "toy", *data_prep.SCENES)
+    scene: str = opt("toy", "toy: synthetic; others: Phototourism", "toy", *data_prep.SCENES)
     data: str = opt("", "an IMC-PT or COLMAP folder instead of a named scene")
     name: str = opt("", "run folder below runs/ (default: scene-method-seed)")
     seed: int = opt(0, "seed of everything random")
@@ -134,7 +134,7 @@ class Config:
             value = getattr(self, setting.name)
             least = AT_LEAST.get(setting.name, 0)
             is_good = setting.type is str or least <= value < 2**31
-            check(is_good, f"--{setting.name} {value} makes no sense: use a number from {least}")
+            check(is_good, f"--{setting.name} {value} is out of range: use {least} to 2^31 - 1")
 
     @property
     def source(self):
@@ -166,7 +166,7 @@ class Scene(NamedTuple):
     is_test: Tensor  # (I,)
     points: Tensor  # (K,3) SfM points
     track_photo: Tensor  # (T,) the photo of a sighting of an SfM point
-    track_uv: Tensor  # (T,2) where in that photo, over its size; in the picture if in 0..1
+    track_uv: Tensor  # (T,2) where in that photo, over its size; beyond 0..1: outside it
     thumbs: Tensor  # (I,3,n,n) uint8, whole photos for the mask network
     raw: dict  # the file in numpy: names, statistics, center, scale, ground truth of the toy
     info: dict
@@ -219,7 +219,7 @@ def make_rays(scene, img, pixel):
     xy = torch.stack([col, row], 1) + 0.5  # (R,2) px
     d = (xy - K[:, 2:]) / K[:, :2]  # (R,2)
     d = F.normalize(F.pad(d, (0, 1), value=1.0))  # (R,3) in camera axes
-    d = torch.einsum("rij,rj->ri", c2w[:, :, :3], d)  # in the world's
+    d = torch.einsum("rij,rj->ri", c2w[:, :, :3], d)  # (R,3) in world axes
     rgb = scene.rgb[scene.start[img] + pixel] / 255
     return Rays(c2w[:, :, 3], d, scene.near[img, None], img, xy / wh, rgb)
 
@@ -307,7 +307,7 @@ class Octree(nn.Module):
         self.width = levels * channels  # LC
         self.root = root
         self.features = nn.Parameter(torch.zeros(1, channels))  # (V,C)
-        self.corner_key = torch.tensor([-1])  # (V,) the corner that owns a row
+        self.corner_key = torch.tensor([-1])  # (V,) sorted; the corner of each row, none at first
         self.row_stride = torch.tensor([root**2, root, 1])
         self.octant_stride = torch.tensor([4, 2, 1])
         self.resolution = root * 2.0 ** torch.arange(levels)  # (L,)
@@ -317,9 +317,9 @@ class Octree(nn.Module):
         """Side of a cell, scene units. level: a number, or a tensor of them."""
         return 2 * self.half / (self.root * 2.0**level)
 
-    def key(self, at):
+    def key(self, cell):
         """One number for a cell or corner (...,4) level, i, j, k, each below 2^13."""
-        level, i, j, k = at.unbind(-1)
+        level, i, j, k = cell.unbind(-1)
         return (level << 39) + (i << 26) + (j << 13) + k
 
     @property
@@ -350,7 +350,8 @@ class Octree(nn.Module):
         is_split = torch.cat(splits)
         first = self.root**3 + 8 * (is_split.cumsum(0) - 1)  # (N,) children follow each other
         self.child = torch.where(is_split, first, 0).int()  # (N,) 0: none
-        self.ends = nn.Buffer(torch.zeros(len(first), 3, device=first.device))  # (N,3) see observe
+        # (N,3) of rays that end in a cell, sums of: error, size of a pixel there, 1
+        self.record = nn.Buffer(torch.zeros(len(first), 3, device=first.device))
 
         corners = self.cells[:, None] + F.pad(octants, (1, 0))  # (N,8,4)
         key = self.key(corners)  # (N,8)
@@ -368,10 +369,10 @@ class Octree(nn.Module):
         """For x (P,3) and each level: the row in cells of the finest cell around x down to that
         level (P,L); whether the level has a cell there (P,L); the place in it, 0..1 (P,L,3). An x
         outside the cube is moved to its border."""
-        at = 0.5 + x * (0.5 / self.half)  # (P,3) over the cube
-        at = at.clamp(0, 1 - 1e-6).nan_to_num(0)
-        at = at[:, None] * self.resolution[:, None]  # (P,L,3) in cells
-        index = at.long()  # (P,L,3)
+        place = 0.5 + x * (0.5 / self.half)  # (P,3) over the cube
+        place = place.clamp(0, 1 - 1e-6).nan_to_num(0)  # a diverging run ends at its next log line
+        place = place[:, None] * self.resolution[:, None]  # (P,L,3) in cells
+        index = place.long()  # (P,L,3)
         octant = ((index & 1) * self.octant_stride).sum(2)  # (P,L)
         node = (index[:, 0] * self.row_stride).sum(1)  # (P,)
         nodes = [node]
@@ -383,7 +384,7 @@ class Octree(nn.Module):
             nodes.append(node)
         nodes = torch.stack(nodes, 1)
         exists = torch.stack(exists, 1)
-        return nodes, exists, at.frac()
+        return nodes, exists, place.frac()
 
     def forward(self, x):
         """Features (P,LC) at x (P,3)."""
@@ -426,20 +427,20 @@ def seed_octree(octree, points, dense, near):
     nn.init.normal_(octree.features, std=0.01)
 
 
-ERROR_SHARE = 0.8  # of the error at the surface lies in the cells that are split
+ERROR_SHARE = 0.8  # of the recorded error lies in the cells that are split
 
 
 @torch.no_grad()
 def worst_cells(octree):
     """The cells (N,4) that should be split: of those whose children are no finer than a pixel, the
-    worst, which hold most of the error recorded in octree.ends. [D15]"""
+    worst, which hold most of the recorded error. [D15]"""
     level = octree.cells[:, 0]  # (N,)
-    error, pixel, count = octree.ends.unbind(1)  # (N,) sums over rays that ended there
+    error, pixel, count = octree.record.unbind(1)  # (N,) sums over rays
     is_coarse = pixel < count * octree.side(level) / 2  # mean size of a pixel under a child's side
     can_split = is_coarse & (octree.child == 0) & (level < octree.levels - 1)
-    error, worst = (error * can_split).sort(descending=True)  # (N,)
-    before = error.cumsum(0) - error  # (N,) what worse cells hold
-    is_chosen = before < ERROR_SHARE * error.sum()
+    found, worst = (error * can_split).sort(descending=True)  # (N,)
+    before = found.cumsum(0) - found  # (N,) what worse cells hold
+    is_chosen = before < ERROR_SHARE * found.sum()
     room = max(0, MAX_CELLS - len(level)) // 8
     return octree.cells[worst[is_chosen][:room]]
 
@@ -468,7 +469,7 @@ def mlp(inputs, hidden, outputs):
 
 
 UNIT = 3**-0.5
-TAPS = (  # a point and, at a distance of 1, the ends of a tetrahedron
+TAPS = (  # a point and, at a distance of 1, the corners of a tetrahedron
     (0.0, 0.0, 0.0),
     (UNIT, UNIT, UNIT),
     (UNIT, -UNIT, -UNIT),
@@ -478,15 +479,15 @@ TAPS = (  # a point and, at a distance of 1, the ends of a tetrahedron
 
 def finite_differences(s, taps, eps):
     """Gradient (P,3) and Laplacian (P,) of a field from its values s (P,5) at x + eps taps: x
-    itself, then the ends of a regular tetrahedron (Neuralangelo uses six ends). [D13]"""
-    grad = 3 / (4 * eps) * (s @ taps)  # (P,3) as the sum of k k^T over the ends k is 4/3 I
+    itself, then the corners of a regular tetrahedron (Neuralangelo's code; its paper has six)."""
+    grad = 3 / (4 * eps) * (s @ taps)  # (P,3) as the sum of k k^T over corners k is 4/3 I
     mean = s[:, 1:].mean(1)
     lap = 6 / eps**2 * (mean - s[:, 0])
     return grad, lap
 
 
 def eikonal(grad):
-    """E_grad = (|grad s| - 1)^2 (P,) of gradients (P,3): a distance grows by 1 a unit."""
+    """E_grad = (|grad s| - 1)^2 (P,) of gradients (P,3): a distance has slope 1."""
     return (grad.norm(dim=1) - 1) ** 2
 
 
@@ -511,11 +512,10 @@ class SDFField(nn.Module):
         return sdf, torch.cat([geo, feat], 1)
 
     def derivatives(self, x, eps):
-        """s (P,), grad s (P,3) and lap s (P,) at x (P,3), from s there and at four taps, eps away."""
+        """grad s (P,3) and lap s (P,) at x (P,3), from s there and at four taps, eps away."""
         points = x[:, None] + eps * self.taps  # (P,5,3)
         sdf, _ = self(points.flatten(0, 1))
-        sdf = sdf.reshape(-1, 5)
-        return sdf[:, 0], *finite_differences(sdf, self.taps, eps)
+        return finite_differences(sdf.reshape(-1, 5), self.taps, eps)
 
 
 class LipschitzLinear(nn.Linear):
@@ -566,10 +566,10 @@ def neus_alpha(sdf, zeta):
 
 
 def composite(alpha):
-    """Weights w_i = T_i alpha_i (R,S), T_i = prod_{j<i} (1 - alpha_j); what passes, T (R,). Eq. 2
-    As a sum of logs; an opaque section still passes 1e-6, or the log would be infinite."""
-    passes = torch.log1p((1e-6 - 1) * alpha)  # (R,S) log of what passes a section
-    trans = torch.exp(passes.cumsum(1) - passes)  # (R,S) T_i
+    """Eq. 2: weights w_i = T_i alpha_i (R,S) with T_i = prod_{j<i} (1 - alpha_j); and what passes
+    all sections (R,). By a sum of logs, in which an opaque section counts as passing 1e-6."""
+    log_passes = torch.log1p((1e-6 - 1) * alpha)  # (R,S) of what passes a section
+    trans = torch.exp(log_passes.cumsum(1) - log_passes)  # (R,S) T_i
     w = trans * alpha
     return w, 1 - w.sum(1)
 
@@ -588,12 +588,12 @@ def inverse_cdf(edges, weight, u):
     return torch.lerp(begin, end, part.clamp(0, 1))
 
 
-PROBES = 64  # cheap lookups of the cached SDF per ray
+PROBES = 64  # sections of a ray between cheap lookups of the cached SDF
 UNIFORM_SHARE = 0.2  # of samples, spread evenly, so that a lost surface can return
 
 
 class SDFCache(nn.Module):
-    """The SDF of the last steps on a dense grid: where along a ray samples pay. [D11]"""
+    """The SDF on a dense grid, renewed every 64 steps: where along a ray samples pay. [D11]"""
     def __init__(self, n):
         super().__init__()
         self.volume = nn.Buffer(torch.zeros(1, 1, n, n, n))  # x slowest
@@ -641,7 +641,7 @@ class Background(nn.Module):
     def __init__(self, points, hidden, per_ray, levels):
         super().__init__()
         self.octree = Octree(2.0, levels, root=32)
-        seed_octree(self.octree, contract(points), dense=levels - 3, near=2)  # SfM points (K,3)
+        seed_octree(self.octree, contract(points), dense=levels - 3, near=2)  # (K,3)
         self.density = mlp(3 + self.octree.width, hidden, 1 + GEO)
         self.color = mlp(GEO + per_ray, hidden, 3)
 
@@ -657,7 +657,7 @@ class Background(nn.Module):
         before = torch.lerp(rays.near, t0, place[:, :n] / n)  # (R,n)
         u = (place[:, n:] - n) / (S - n)  # (R,S-n)
         beyond = u / (1 - u).clamp(min=1e-3)
-        path = torch.cat([before, t0 + beyond], 1)  # (R,S) with the sphere cut out
+        path = torch.cat([before, t0 + beyond], 1)  # (R,S) without the sphere, for lengths
         t = torch.cat([before, t1 + beyond], 1)  # (R,S)
         x = contract(rays.at(t)).flatten(0, 1)  # (RS,3)
         inputs = torch.cat([x, self.octree(x)], 1)  # (RS,3+LC)
@@ -678,10 +678,10 @@ class Background(nn.Module):
 
 
 def render_rays(model, rays, code, jitter):
-    """One ray batch through the whole model. code: (R,A) appearance; jitter in 0..1: S - 1 columns
-    for the foreground, then the background's. Returns a dictionary: rgb (R,3); opacity (R,); depth
-    (R,) and end (R,3), where the ray ends on average, both without gradient; normal (R,3), times
-    opacity, e_grad and e_curv (R,) at that end; t (R,S+1) of the samples."""
+    """One ray batch through the whole model, GeoNVS of section 7. code: (R,A) appearance; jitter in
+    0..1: S - 1 columns for the foreground, then the background's. Returns a dictionary: rgb (R,3);
+    opacity (R,); depth (R,) and end (R,3), where the ray ends on average, both without gradient;
+    normal (R,3), times opacity, e_grad and e_curv (R,) at that end; t (R,S+1) of the samples."""
     S = model.cfg.samples
     zeta = model.deviation()
     inner, outer = jitter.split([S - 1, model.cfg.bg_samples], 1)
@@ -693,13 +693,13 @@ def render_rays(model, rays, code, jitter):
     w, trans = composite(alpha)  # (R,S), (R,)
     at_near_end = F.pad(w, (0, 1))  # (R,S+1)
     at_far_end = F.pad(w, (1, 0))
-    w = (at_far_end + at_near_end) / 2  # (R,S+1) of samples: half of their two sections' [D2]
+    w = (at_far_end + at_near_end) / 2  # (R,S+1) of samples: mean of the sections beside it [D2]
 
     opacity = 1 - trans
     depth = (w * t).sum(1) + trans * t1[:, 0]
-    depth = depth.detach()  # (R,)
+    depth = depth.detach()  # (R,) a ray that hits nothing ends where it leaves the sphere
     end = rays.at(depth[:, None])[:, 0]  # (R,3)
-    _, grad, lap = model.sdf.derivatives(end, model.eps)  # (R,3), (R,)
+    grad, lap = model.sdf.derivatives(end, model.eps)  # (R,3), (R,) [D13]
     normal = F.normalize(grad)
 
     per_ray = torch.cat([rays.d, code], 1)  # (R,3+A)
@@ -793,10 +793,10 @@ def complexity(e_grad, e_curv):
     return 10.0 * e_grad + 2.0 * e_curv
 
 
-def edge_indicator(complexity, centre=0.0, width=1.0):
-    """Phi: a sigmoid of complexity (R,). Eq. 4
-    Its centre and width are calibrated [D3]: with 0 and 1 Phi is above 0.5 on every ray."""
-    return torch.sigmoid((complexity - centre) / width)
+def edge_indicator(richness, centre=0.0, width=1.0):
+    """The sigmoid of Eq. 4, of a ray's complexity (R,). Its centre and width are calibrated [D3]:
+    with 0 and 1 it is above 0.5 on every ray."""
+    return torch.sigmoid((richness - centre) / width)
 
 
 def gpl_loss(mask, phi):
@@ -816,13 +816,13 @@ def transient_loss(logit, error, price):
 
 REJECTING = 0.3  # share of training in which outliers are rejected [D7]
 LEAST_PRICE = 0.15  # error of a ray below which it is never transient
-TAUGHT = 0.6  # share of training in which the mask learns; later it would give up people
+TAUGHT = 0.6  # share of training in which the mask learns; longer, it would give people up
 
 
 def reject_outliers(mask, is_outlier, done):
-    """M (R,), but 1 for outliers, rays whose error exceeds their price, that the network suspects
-    too. It has to suspect them more from step to step, and after 30 % of training M alone counts:
-    at first the scene must not learn to paint people, later it must learn its details. [D7]"""
+    """M (R,), but 1 for outliers, rays whose error exceeds their price, if M exceeds a bound. That
+    rises from 0 to 1 in the first 30 % of training: at first the scene must not learn to paint
+    people, later it must learn its details. [D7]"""
     suspicion = (done / REJECTING) ** 2
     return torch.where(is_outlier & (mask > suspicion), 1.0, mask)
 
@@ -837,15 +837,15 @@ def follow_quantiles(running, shares, values, is_chosen):
 
 
 class TransientMask(nn.Module):
-    """M, which pixels show what passes by: CGNet on small photos, and what prices depend on."""
+    """CGNet on small photos, which gives M, and the running quantiles that prices depend on."""
     def __init__(self, scene):
         super().__init__()
         self.cgnet = CGNet()
         self.thumbs = scene.thumbs
         self.shares = torch.tensor([0.5, 0.75, 0.95])
-        self.complexity = nn.Buffer(torch.tensor([0.5, 1.0, 4.0]))  # (3,) of foreground rays
+        self.richness = nn.Buffer(torch.tensor([0.5, 1.0, 4.0]))  # (3,) of foreground rays
         self.sfm_error = nn.Buffer(torch.tensor([0.3]))  # (1,) upper quartile at SfM pixels
-        # which pixels of small photos show SfM points; some wrongly, at outlines [D10]
+        # (I,n,n) which pixels of masks show SfM points; some wrongly, at outlines [D10]
         n = scene.thumbs.shape[3] // 2
         static = torch.zeros(len(scene.thumbs), n, n, dtype=torch.bool)
         uv = scene.track_uv
@@ -864,11 +864,12 @@ class TransientMask(nn.Module):
         col, row = pixel.unbind(1)
         return self.static[rays.img, row, col]
 
-    def phi(self, complexity, opacity):
-        """Phi (R,): 0.5 for the upper quartile of what rays find on the foreground. [D3]"""
-        p50, p75, p95 = self.complexity
+    def phi(self, richness, opacity):
+        """Phi (R,), Eq. 4: opacity times the sigmoid, which is 0.5 at the upper quartile of rays
+        that end on the foreground. richness: their complexity. [D3]"""
+        p50, p75, p95 = self.richness
         width = ((p95 - p50) / 4).clamp(min=1e-3)
-        return opacity * edge_indicator(complexity, p75, width)
+        return opacity * edge_indicator(richness, p75, width)
 
     def price(self, phi, lam_mask, lam_gpl):
         """The error (R,) above which a ray is transient. [D7]"""
@@ -884,7 +885,7 @@ def is_on(setting, default):
 
 
 class GeoNVS(nn.Module):
-    """The paper's model: it assembles the parts above and sums their losses. To be made under
+    """The paper's model: it assembles the parts above and sums their losses. Make it under
     torch.device(the scene's)."""
     name = "geonvsw"
     adam = dict(betas=(0.9, 0.99), eps=1e-15)  # as is usual for feature grids (Instant-NGP)
@@ -896,7 +897,7 @@ class GeoNVS(nn.Module):
         raw = scene.raw
         levels = cfg.levels
         if levels == 0:  # no cell smaller than a pixel [D15]
-            pixels = 2 / raw["footprint"]  # from side to side
+            pixels = 2 / raw["footprint"]  # across the sphere; footprint: a pixel's size there
             levels = int(np.clip(1 + np.log2(pixels / ROOT), 2, 8))
         A = 0
         if is_on(cfg.appearance, raw["exposure_spread"] > 0.01):
@@ -918,8 +919,8 @@ class GeoNVS(nn.Module):
         self.octrees = [octree]
         self.background = None
         self.bg_color = torch.tensor(np.nan_to_num(raw["bg_color"], nan=0.5).tolist())
-        has_colors = np.isnan(raw["bg_color"]).any()  # nan: it has no one colour
-        if is_on(cfg.background, has_colors):
+        is_varied = np.isnan(raw["bg_color"]).any()  # nan: there is no one colour
+        if is_on(cfg.background, is_varied):
             points = scene.points[~is_inside]
             self.background = Background(points, cfg.hidden, 3 + A, min(levels, 4))
             self.octrees.append(self.background.octree)
@@ -940,8 +941,8 @@ class GeoNVS(nn.Module):
 
     def losses(self, rays, photos, done, gen):
         """The objective, Eq. 5, of rays that come photo by photo, equally many of each of photos
-        (B,); done: share of training, 0..1. Returns the weighted sum; the raw terms by name; what
-        `observe` learns from."""
+        (B,); done: share of training, 0..1. Returns the weighted sum; raw terms by name, more for
+        the log among them; what `observe` learns from."""
         cfg = self.cfg
         R = len(rays.o)
         code = self.appearance(photos).repeat_interleave(R // len(photos), 0)  # (R,A)
@@ -951,8 +952,8 @@ class GeoNVS(nn.Module):
 
         error = residual.detach().amax(1)  # (R,) of the worst channel
         is_static = self.mask.is_static(rays)  # (R,)
-        detail = complexity(out["e_grad"], out["e_curv"]).detach()  # (R,)
-        phi = self.mask.phi(detail, out["opacity"].detach())  # (R,)
+        richness = complexity(out["e_grad"], out["e_curv"]).detach()  # (R,)
+        phi = self.mask.phi(richness, out["opacity"].detach())  # (R,)
         mask = torch.zeros_like(error)
         l_mask = 0.0
         if cfg.mask != "off":
@@ -968,9 +969,8 @@ class GeoNVS(nn.Module):
         t = out["t"].gather(1, which[:, None])  # (R,1)
         sample = rays.at(t)[::2, 0]  # (N,3) a random one of every second ray [D13]
         sfm = self.sfm[random_index(gen, len(self.sfm), len(sample))]  # (N,3)
-        s, grad, _ = self.sdf.derivatives(torch.cat([sample, sfm]), self.eps)
-        grad, _ = grad.chunk(2)  # (N,3) of the samples
-        _, s_sfm = s.chunk(2)  # (N,) of the SfM points
+        grad, _ = self.sdf.derivatives(sample, self.eps)  # (N,3)
+        s_sfm = self.distance(sfm)  # (N,)
         pull = self.deviation().detach().clamp(max=40)  # [D10]
 
         terms = dict(
@@ -980,7 +980,7 @@ class GeoNVS(nn.Module):
             curv=out["e_curv"].mean(),  # [D4]
             lps=lipschitz_loss(self.color),
             sfm=pull * s_sfm.abs().mean(),
-            mask=mask.mean(),
+            mask=mask.mean(),  # for the log, like gpl: rejected rays count as 1
             gpl=gpl_loss(mask, phi))
         total = (
             terms["rgb"]
@@ -989,28 +989,29 @@ class GeoNVS(nn.Module):
             + cfg.lam_lps * terms["lps"]
             + cfg.lam_sfm * terms["sfm"]  # [D10]
             + l_mask)  # lam_mask L_reg + lam_gpl L_GPL, by way of its price [D7]
-        out |= dict(error=error, mask=mask, is_static=is_static, detail=detail)
+        out |= dict(error=error, mask=mask, is_static=is_static, richness=richness)
         return total, terms, out
 
     def before_step(self, step, done):
         """Keeps zeta within its bounds and the cache up to date. done: 0..1."""
-        self.deviation.bound(done, most=32 * self.cfg.samples)  # 1/64 of an even section
+        self.deviation.bound(done, most=32 * self.cfg.samples)  # a wall of 1/64 of an even section
         if step % 64 == 0:
             self.cache.refresh(self.distance)
 
     @torch.no_grad()
     def observe(self, rays, out):
         """Remembers what refining and the mask's prices depend on."""
-        mask = self.mask
+        prices = self.mask
+        quartile = prices.shares[1:2]
         is_solid = out["opacity"] > 0.5  # (R,)
-        follow_quantiles(mask.complexity, mask.shares, out["detail"], is_solid)
-        follow_quantiles(mask.sfm_error, mask.shares[1:2], out["error"], out["is_static"])
+        follow_quantiles(prices.richness, prices.shares, out["richness"], is_solid)
+        follow_quantiles(prices.sfm_error, quartile, out["error"], out["is_static"])
         pixel = out["depth"] / self.scene.K[rays.img, 0]  # (R,) its size at the ray's end
         error = (1 - out["mask"]) * out["error"]
         columns = torch.stack([error, pixel, torch.ones_like(error)], 1)  # (R,3)
         octree = self.sdf.octree
         node, _, _ = octree.locate(out["end"])
-        octree.ends.index_add_(0, node[:, -1], is_solid[:, None] * columns)
+        octree.record.index_add_(0, node[:, -1], is_solid[:, None] * columns)
 
     def batch(self, photos, n, gen):
         """n random rays and the photos (B,) they come from, photo by photo."""
@@ -1041,8 +1042,7 @@ class GeoNVS(nn.Module):
         for name in ("exp_avg", "exp_avg_sq"):
             state[name] = carry_rows(state[name], old_row)
         optimizer.state[octree.features] = state
-        _, grids, *_ = optimizer.param_groups
-        grids["params"][0] = octree.features
+        optimizer.param_groups[1]["params"][0] = octree.features  # see groups
 
     @torch.no_grad()
     def decide_mask(self):
@@ -1100,7 +1100,7 @@ class EnergyMeter:
             self.joules += max(0.0, now - self.last)
             self.last = now
         except Exception as error:  # a package, a driver's answer or a permission is missing
-            print(f"  energy is null ({error}); a GPU's needs: pip install nvidia-ml-py")
+            print(f"  energy is null ({error}); on a GPU: pip install nvidia-ml-py")
             self.joules = None
 
 
@@ -1242,9 +1242,9 @@ def train(cfg, scene, run, saved=None, kind=GeoNVS):
         if RANKS == 1 or state["step"] % 16 == 0 or state["step"] == cfg.steps:
             state["seconds"] = from_first_process(time.perf_counter() - begin)
         done = share_done(cfg, state)
-        if any(before < share <= done for share in REFINE_AT):
+        if terms and any(before < share <= done for share in REFINE_AT):
             model.refine(optimizer)
-        if before < REFINE_AT[-1] <= done:
+        if before < TAUGHT <= done:
             model.decide_mask()
         before = done
         is_due = done >= 1 or state["seconds"] >= next_log
@@ -1266,7 +1266,7 @@ def report(model, path, done, state, terms):
     check(is_sound, "the loss is no longer finite: mend poses, or try a third of the learning "
           f"rates --lr_grid and --lr_net; checkpoint.pt beside {path} is from before")
     numbers = {key: value.item() for key, value in terms.items()}
-    numbers["psnr"] = -10 * math.log10(numbers["mse"])
+    numbers["psnr"] = -10 * math.log10(max(numbers["mse"], 1e-10))
     with open(path, "a") as file:
         print(json.dumps(state | numbers), file=file)
     print(f"  {done:4.0%}  step {state['step']}  psnr {numbers['psnr']:.2f}", flush=True)
@@ -1293,7 +1293,7 @@ def make_lpips():
         import lpips
         return lpips.LPIPS(net="alex", verbose=False)
     except Exception as error:  # not installed, or its weights cannot be fetched
-        print(f"  lpips is null ({error}): pip install lpips, with a network for its weights")
+        print(f"  lpips is null ({error}): pip install lpips, and internet for its weights")
         return None
 
 
@@ -1403,7 +1403,7 @@ def toy_truth(model, scene):
     names = ("near_wall", "near_wall_sdf", "wall", "wall_normal")
     near, sdf, wall, normal = [torch.as_tensor(raw[name]).to(scene.c2w) for name in names]
     error = (in_chunks(model.distance, near) - sdf).abs()
-    _, grad, _ = model.sdf.derivatives(wall, 0.004)
+    grad, _ = model.sdf.derivatives(wall, 0.004)
     cos = F.cosine_similarity(grad, normal).clamp(-1, 1)
     truth = dict(
         sdf_error=error.mean().item(),
@@ -1455,7 +1455,7 @@ def extract_mesh(model):
 
 def surface_color(model, x):
     """Colours (P,3) of surface points (P,3), seen along their normals under the mean code."""
-    _, grad, _ = model.sdf.derivatives(x, model.eps)
+    grad, _ = model.sdf.derivatives(x, model.eps)
     normal = F.normalize(grad)
     code = mean_code(model).expand(len(x), -1)
     _, geo = model.sdf(x)
@@ -1464,7 +1464,7 @@ def surface_color(model, x):
 
 
 def write_ply(path, vertices, faces, colors):
-    """A PLY file of text; nine digits, as coordinates of a map would lose their metres."""
+    """A PLY file of text; with fewer than nine digits coordinates of a map lose their metres."""
     header = f"""ply
 format ascii 1.0
 element vertex {len(vertices)}
@@ -1674,7 +1674,7 @@ def main(argv=None):
 
 
 def run_command_line(entry):
-    """Exit code 0, or 2 with one sentence on stderr."""
+    """Exit code 0, or 2 with one sentence on stderr; a bug keeps its traceback."""
     try:
         entry()
         return

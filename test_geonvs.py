@@ -1529,12 +1529,12 @@ def test_the_worst_cells_that_hold_most_of_the_error_are_chosen(monkeypatch, lim
     octree = make_tree(half=1.0, root=4)
     n = len(octree.cells)
     monkeypatch.setattr(geonvs, "MAX_CELLS", n + 8 * limit)
-    octree.ends = torch.stack(
+    octree.record = torch.stack(
         [random(n), 0.4 * random(n), torch.full((n,), 2.0)],
         1)
     candidates = []
     for row, level in enumerate(octree.cells[:, 0].tolist()):
-        error, pixel, count = octree.ends[row].tolist()
+        error, pixel, count = octree.record[row].tolist()
         child_side = 0.25 / 2**level
         is_open = level < 3 and octree.child[row] == 0
         if is_open and pixel / count < child_side:
@@ -1832,7 +1832,7 @@ def fake_out():
     index = torch.arange(1000)
     return dict(
         opacity=torch.where(index < 40, 0.9, 0.1),
-        detail=torch.where(index < 40, random(1000), 50.0),
+        richness=torch.where(index < 40, random(1000), 50.0),
         error=random(1000),
         is_static=index % 2 == 0,
         depth=2 + random(1000),
@@ -1845,13 +1845,13 @@ def test_phi_is_calibrated_on_the_foreground_however_few_rays_end_there(warm):
     out = fake_out()
     for _ in range(300):
         warm.observe(rays, out)
-    phi = warm.mask.phi(out["detail"], out["opacity"])[:40] / 0.9
+    phi = warm.mask.phi(out["richness"], out["opacity"])[:40] / 0.9
     close((phi > 0.5).float().mean(), 0.25, 0.02)
     assert phi.std() > 0.2
 
 
 def test_phi_has_a_width_if_all_quantiles_are_alike(warm):
-    warm.mask.complexity.fill_(2.0)
+    warm.mask.richness.fill_(2.0)
     phi = warm.mask.phi(torch.tensor([2, 2.001]), 0.8)
     close(phi, [0.4, 0.8 / (1 + math.exp(-1))], 1e-3)
 
@@ -1868,7 +1868,7 @@ def test_observing_follows_errors_of_sfm_pixels_and_records_where_rays_end(warm)
     for r in range(40):  # the others end beyond the foreground
         wanted[finest[r]] += columns[r]
     warm.observe(rays, out)
-    close(octree.ends, wanted)
+    close(octree.record, wanted)
     for _ in range(200):
         warm.observe(rays, out)
     close(
@@ -1888,7 +1888,7 @@ def plain_losses(model, rays, photos, done, gen):
     which = (geonvs.uniform(gen, R) * (cfg.samples + 1)).long()
     sfm = (geonvs.uniform(gen, half) * len(model.sfm)).long()
     out = geonvs.render_rays(model, rays, model.appearance(rays.img), jitter)
-    p50, p75, p95 = model.mask.complexity.tolist()
+    p50, p75, p95 = model.mask.richness.tolist()
     price = max(0.15, cfg.lam_mask + model.mask.sfm_error.item())
     n = model.mask.static.shape[1]
     terms = dict.fromkeys(
@@ -1921,7 +1921,7 @@ def plain_losses(model, rays, photos, done, gen):
         terms["eik"] += e_grad / 2 / R
         if r % 2 == 0:
             x = rays.o[r] + out["t"][r, which[r]] * rays.d[r]
-            _, grad, _ = model.sdf.derivatives(x[None], model.eps)
+            grad, _ = model.sdf.derivatives(x[None], model.eps)
             terms["eik"] += (grad.norm() - 1) ** 2 / 2 / half
         terms["curv"] += e_curv / R
         terms["mask"] += M / R
@@ -1950,7 +1950,7 @@ def test_the_objective_and_its_gradients_equal_plain_loops(
     model = rough_model(warm_start, mask=mask, lam_gpl=0.4, **LAMBDAS)
     rays, photos = rough_rays(model)
     model.deviation.v.data.fill_(math.log(zeta) / 10)
-    model.mask.complexity.copy_(torch.tensor([1.0, 6, 20]))
+    model.mask.richness.copy_(torch.tensor([1.0, 6, 20]))
     model.mask.sfm_error.fill_(sfm_error)
     model.mask.static.bernoulli_(0.5)
     total, terms, _ = model.losses(rays, photos, done, generator())
@@ -2651,7 +2651,7 @@ def knowing(warm):
     def derivatives(x, eps):
         steps = eps * torch.eye(3)
         rises = [distance(x + step) - distance(x - step) for step in steps]
-        return None, torch.stack(rises, 1), None
+        return torch.stack(rises, 1), None
 
     def render(rays, code):
         is_right = rays.uv[:, :1] > 0.48
@@ -2696,7 +2696,7 @@ def test_toy_truth_measures_a_known_error(knowing, scene):
     true = knowing.distance
     gradient = knowing.sdf.derivatives
     knowing.distance = lambda x: true(x) - 0.01
-    knowing.sdf.derivatives = lambda x, eps: (None, -gradient(x, eps)[1], None)
+    knowing.sdf.derivatives = lambda x, eps: (-gradient(x, eps)[0], None)
     knowing.mask.logits = lambda photos: torch.full((1, 1, 8, 8), math.log(3))  # M = 3/4
     truth = geonvs.toy_truth(knowing, scene)
     is_test = np.repeat(scene.raw["is_test"], np.diff(scene.raw["start"]))
@@ -2722,7 +2722,7 @@ def test_the_mesh_of_a_ball_is_that_ball_and_its_colours_are_seen_from_outside(w
     centre = torch.tensor([0.1, -0.2, 0.3])
     warm.color.forward = show_normals
     warm.distance = lambda x: (x - centre).norm(dim=1) - 0.25
-    warm.sdf.derivatives = lambda x, eps: (None, x - centre, None)
+    warm.sdf.derivatives = lambda x, eps: (x - centre, None)
     warm.cache.refresh(warm.distance)
     vertices, faces, colors = geonvs.extract_mesh(warm)
     x = (vertices - scene.raw["center"]) / scene.raw["scale"] - centre.numpy()
@@ -3427,15 +3427,15 @@ seed_octree = geonvs.seed_octree  # the method's own, while a row replaces it
 
 class FlatPhi(geonvs.TransientMask):
     """Phi is its mean over the rays of a step: a higher price for the mask, blind to edges."""
-    def phi(self, complexity, opacity):
-        phi = super().phi(complexity, opacity)
+    def phi(self, richness, opacity):
+        phi = super().phi(richness, opacity)
         return phi.mean().expand_as(phi)
 
 
 class LiteralPhi(geonvs.TransientMask):
     """Phi with a sigmoid as it stands in Eq. 4, neither calibrated nor faded: above 0.5 always."""
-    def phi(self, complexity, opacity):
-        return geonvs.edge_indicator(complexity)
+    def phi(self, richness, opacity):
+        return geonvs.edge_indicator(richness)
 
 
 class PrintedPrice(geonvs.TransientMask):
