@@ -61,7 +61,7 @@ import resource
 import subprocess
 import sys
 import time
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -83,8 +83,9 @@ torch.set_float32_matmul_precision("highest")  # [D9] no TF32, which some contai
 # ---- 1 Config: every field is a flag -------------------------------------------------------------
 
 def opt(default, text, *choices):
-    text = f"{text} [{default}]"
-    return field(default=default, metadata=dict(help=text, choices=choices or None))
+    return field(
+        default=default,
+        metadata=dict(help=f"{text} [{default}]", choices=choices or None))
 
 
 AT_LEAST = dict(  # 0 for other settings
@@ -133,14 +134,14 @@ class Config:
         for setting in fields(self):
             value = getattr(self, setting.name)
             least = AT_LEAST.get(setting.name, 0)
-            is_good = setting.type is str or least <= value < 2**31
-            check(is_good, f"--{setting.name} {value} is out of range: use {least} to 2^31 - 1")
+            check(setting.type is str or least <= value < 2**31,
+                  f"--{setting.name} {value} is out of range: use {least} to 2^31 - 1")
 
     @property
     def source(self):
         """What data_prep.open_scene takes: a scene's name, or an absolute path."""
         if self.data:
-            return str(Path(self.data).resolve())
+            return os.path.realpath(self.data)
         return self.scene
 
 
@@ -165,9 +166,8 @@ class Scene(NamedTuple):
     near: Tensor  # (I,) smallest useful t
     is_test: Tensor  # (I,)
     points: Tensor  # (K,3) SfM points
-    track_photo: Tensor  # (T,) the photo of a sighting of an SfM point
-    track_uv: Tensor  # (T,2) where in that photo, over its size; beyond 0..1: outside it
     thumbs: Tensor  # (I,3,n,n) uint8, whole photos for the mask network
+    static: Tensor  # (I,n/2,n/2) mask pixels that show SfM points; some wrongly, at outlines [D10]
     raw: dict  # the file in numpy: names, statistics, center, scale, ground truth of the toy
     info: dict
 
@@ -178,20 +178,22 @@ class Scene(NamedTuple):
 
 def load_scene(raw, device="cpu"):
     """Scene from the dictionary of a scene file (data_prep.open_scene, make_toy or prepare)."""
-    long_side = np.median(raw["wh"].max(1))  # px
-    side = int(np.clip(long_side / 2, 64, 256))  # [D6]
-    thumbs = []
-    for pixels, (w, h) in zip(np.split(raw["rgb"], raw["start"][1:]), raw["wh"]):
-        photo = pixels.reshape(h, w, 3)
-        thumbs.append(cv2.resize(photo, (side, side), interpolation=cv2.INTER_AREA))
-    arrays = [raw[key] for key in Scene._fields[:10]]
-    arrays.append(np.stack(thumbs).transpose(0, 3, 1, 2))
+    side = int(np.clip(np.median(raw["wh"].max(1)) / 2, 64, 256))  # px, half the long side [D6]
+    thumbs = [
+        cv2.resize(pixels.reshape(h, w, 3), (side, side), interpolation=cv2.INTER_AREA)
+        for pixels, (w, h) in zip(np.split(raw["rgb"], raw["start"][1:]), raw["wh"])]
+    n = side // 2
+    uv = raw["track_uv"]  # (T,2)
+    is_seen = ((uv >= 0) & (uv < 1)).all(1)  # (T,) the point lies in the picture
+    col, row = (uv[is_seen] * n).astype(int).T
+    static = np.zeros((len(thumbs), n, n), bool)
+    static[raw["track_photo"][is_seen], row, col] = True
+    arrays = [raw[key] for key in Scene._fields[:8]]
+    arrays += [np.stack(thumbs).transpose(0, 3, 1, 2), static]
     tensors = []
     for array in arrays:
         tensor = torch.as_tensor(array, device=device)
-        if tensor.is_floating_point():
-            tensor = tensor.float()
-        tensors.append(tensor)
+        tensors.append(tensor.float() if tensor.is_floating_point() else tensor)
     return Scene(*tensors, raw, json.loads(str(raw["info"])))
 
 
@@ -212,12 +214,11 @@ class Rays(NamedTuple):
 def make_rays(scene, img, pixel):
     """Rays through pixels. img, pixel: (R,) photo, and row-major number in it."""
     wh = scene.wh[img]  # (R,2)
-    K = scene.K[img]  # (R,4)
+    w = wh[:, 0]
+    focal, centre = scene.K[img].split(2, 1)  # (R,2)
     c2w = scene.c2w[img]  # (R,3,4)
-    col = pixel % wh[:, 0]
-    row = pixel // wh[:, 0]
-    xy = torch.stack([col, row], 1) + 0.5  # (R,2) px
-    d = (xy - K[:, 2:]) / K[:, :2]  # (R,2)
+    xy = torch.column_stack([pixel % w, pixel // w]) + 0.5  # (R,2) px
+    d = (xy - centre) / focal  # (R,2)
     d = F.normalize(F.pad(d, (0, 1), value=1.0))  # (R,3) in camera axes
     d = torch.einsum("rij,rj->ri", c2w[:, :, :3], d)  # (R,3) in world axes
     rgb = scene.rgb[scene.start[img] + pixel] / 255
@@ -239,8 +240,7 @@ def random_rays(scene, img, gen, part=1.0):
     w, h = scene.wh[img].unbind(1)
     u, v = uniform(gen, 2, len(img))
     col = (u * (part * w).long()).long()
-    row = (v * h).long()
-    return make_rays(scene, img, row * w + col)
+    return make_rays(scene, img, (v * h).long() * w + col)
 
 
 def sphere_interval(rays):
@@ -248,25 +248,21 @@ def sphere_interval(rays):
     or has it behind, gets an empty interval: at its closest approach, or at near."""
     closest = -(rays.o * rays.d).sum(1, keepdim=True)  # (R,1)
     distance = rays.at(closest).norm(dim=2)  # (R,1) from the sphere's centre
-    half = (1 - distance**2).clamp(min=0).sqrt()
+    half = (1 - distance**2).clamp_min(0).sqrt()
     t0 = torch.maximum(closest - half, rays.near)
-    t1 = torch.maximum(closest + half, t0)
-    return t0, t1
+    return t0, torch.maximum(closest + half, t0)
 
 
 # ---- 3 Octree: features on the corners of cells --------------------------------------------------
 
-CHUNK = 2**15  # points evaluated at once without gradient
 ROOT = 16  # cells of the coarsest level along an axis
 MAX_CELLS = 8_000_000  # of the foreground: about 1 GB with Adam's moments, more while refining
 
 
 def corner_weights(f):
     """Trilinear weights (P,8) of a cell's corners at f (P,3), 0..1 within the cell."""
-    ends = torch.stack([1 - f.T, f.T])  # (2,3,P)
-    x, y, z = ends.unbind(1)  # (2,P)
-    w = torch.einsum("ip,jp,kp->ijkp", x, y, z)  # (2,2,2,P)
-    return w.flatten(0, 2).T.contiguous()
+    ends = torch.stack([1 - f.T, f.T], 1)  # (3,2,P)
+    return torch.einsum("ip,jp,kp->pijk", *ends).flatten(1).contiguous()
 
 
 class WeightedSum(torch.autograd.Function):
@@ -275,23 +271,30 @@ class WeightedSum(torch.autograd.Function):
     autograd's own backward takes several times as long."""
     @staticmethod
     def forward(ctx, table, row, w):  # (V,C), (P,8), (P,8) -> (P,C)
-        ctx.save_for_backward(row, w)
-        ctx.shape = table.shape
+        ctx.save_for_backward(table, row, w)
         return F.embedding_bag(row, table, per_sample_weights=w, mode="sum")
 
     @staticmethod
     def backward(ctx, grad):  # (P,C)
-        row, w = ctx.saved_tensors
+        table, row, w = ctx.saved_tensors
         share = w[:, :, None] * grad[:, None]  # (P,8,C)
-        out = grad.new_zeros(ctx.shape)  # (V,C)
+        out = torch.zeros_like(table)  # (V,C)
         out.index_add_(0, row.flatten().long(), share.flatten(0, 1))
         return out, None, None
 
 
-def grid_index(n, device):
+def grid_index(n, like):
     """All index triples (n^3,3) of a cube of n^3 cells, the last index fastest."""
-    axis = torch.arange(n, device=device)
-    return torch.cartesian_prod(axis, axis, axis)
+    return like.new_ones(n, n, n).nonzero()
+
+
+def number_of(index, n=2**13):
+    """One number (...) for integers (...,d), each below n: its digits, the largest place first. For
+    a cell or corner (level, i, j, k) it is the key."""
+    number = 0
+    for digit in index.unbind(-1):
+        number = number * n + digit
+    return number
 
 
 class Octree(nn.Module):
@@ -306,148 +309,122 @@ class Octree(nn.Module):
         self.levels = levels
         self.width = levels * channels  # LC
         self.root = root
-        self.features = nn.Parameter(torch.zeros(1, channels))  # (V,C)
-        self.corner_key = torch.tensor([-1])  # (V,) sorted; the corner of each row, none at first
-        self.row_stride = torch.tensor([root**2, root, 1])
-        self.octant_stride = torch.tensor([4, 2, 1])
-        self.resolution = root * 2.0 ** torch.arange(levels)  # (L,)
-        self.build(self.corner_key)  # no cell has the key -1: none is split
-
-    def side(self, level):
-        """Side of a cell, scene units. level: a number, or a tensor of them."""
-        return 2 * self.half / (self.root * 2.0**level)
-
-    def key(self, cell):
-        """One number for a cell or corner (...,4) level, i, j, k, each below 2^13."""
-        level, i, j, k = cell.unbind(-1)
-        return (level << 39) + (i << 26) + (j << 13) + k
-
-    @property
-    def split_keys(self):
-        return self.key(self.cells[self.child > 0])
+        self.features = nn.Parameter(torch.zeros(0, channels))  # (V,C)
+        self.corner_key = torch.arange(0)  # (V,) sorted; the corner of each row, none at first
+        self.resolution = root * 2.0 ** torch.arange(levels)  # (L,) cells along an axis
+        self.side = 2 * half / self.resolution  # (L,) of a cell, scene units
+        self.build(self.corner_key)  # no cell is split
 
     def split(self, cells):
         """Splits cells (...,4); the function stays, as new features are zero. See build."""
-        return self.build(torch.cat([self.split_keys, self.key(cells).flatten()]))
+        return self.build(torch.cat([self.split_keys, number_of(cells).flatten()]).unique())
 
     def build(self, split_keys):
-        """Makes cells and corners from the keys of the cells that are split. New features are
-        zero. Returns the former row (V,) of every row, -1 if new."""
-        octants = grid_index(2, split_keys.device)  # (8,3)
-        index = grid_index(self.root, split_keys.device)  # (N,3)
+        """Makes cells and corners from the keys of the cells that are split, all that were split
+        before among them. New features are zero. Returns which rows (V,) are old, in old order."""
+        self.split_keys = split_keys
+        octants = grid_index(2, split_keys)  # (8,3)
+        index = grid_index(self.root, split_keys)  # (N,3)
         levels = []
         splits = []
         for level in range(self.levels):
             cells = F.pad(index, (1, 0), value=level)  # (N,4)
-            is_split = torch.isin(self.key(cells), split_keys)  # (N,)
+            is_split = torch.isin(number_of(cells), split_keys)  # (N,)
             is_split &= level < self.levels - 1
             levels.append(cells)
             splits.append(is_split)
-            children = 2 * index[is_split][:, None] + octants  # (N,8,3)
+            children = 2 * index[is_split, None] + octants  # (N,8,3)
             index = children.flatten(0, 1)
         self.cells = torch.cat(levels)  # (N,4) level, i, j, k
-        self.finest = self.side(self.cells[-1, 0].item())  # side of the smallest cell
+        self.finest = self.side[self.cells[-1, 0]].item()  # side of the smallest cell
         is_split = torch.cat(splits)
         first = self.root**3 + 8 * (is_split.cumsum(0) - 1)  # (N,) children follow each other
-        self.child = torch.where(is_split, first, 0).int()  # (N,) 0: none
+        self.child = (first * is_split).int()  # (N,) 0: none
         # (N,3) of rays that end in a cell, sums of: error, size of a pixel there, 1
-        self.record = nn.Buffer(torch.zeros(len(first), 3, device=first.device))
+        self.record = nn.Buffer(self.features.new_zeros(len(first), 3))
 
-        corners = self.cells[:, None] + F.pad(octants, (1, 0))  # (N,8,4)
-        key = self.key(corners)  # (N,8)
-        _, number, cells_around = key.unique(return_inverse=True, return_counts=True)
-        self.is_free = cells_around[number] == 8  # (N,8)
-        old_key = self.corner_key
-        self.corner_key = key[self.is_free].unique()  # (V,)
-        self.corner = nearest_row(self.corner_key, key).int()  # (N,8) any row, where hanging
-        old_row = nearest_row(old_key, self.corner_key)
-        old_row = torch.where(old_key[old_row] == self.corner_key, old_row, -1)
-        self.features = nn.Parameter(carry_rows(self.features.detach(), old_row))
-        return old_row
+        corners = number_of(self.cells[:, None] + F.pad(octants, (1, 0)))  # (N,8) keys
+        key, number, cells_around = corners.unique(return_inverse=True, return_counts=True)
+        is_whole = cells_around == 8  # (.,) has a feature
+        row = (is_whole.cumsum(0) - 1).clamp_min(0)  # any row, where hanging
+        self.is_free = is_whole[number]  # (N,8)
+        self.corner = row[number].int()  # (N,8)
+        key = key[is_whole]  # (V,)
+        is_old = torch.isin(key, self.corner_key)
+        self.corner_key = key
+        self.features = nn.Parameter(place_rows(self.features.detach(), is_old))
+        return is_old
 
     def locate(self, x):
         """For x (P,3) and each level: the row in cells of the finest cell around x down to that
-        level (P,L); whether the level has a cell there (P,L); the place in it, 0..1 (P,L,3). An x
-        outside the cube is moved to its border."""
+        level (P,L); the place in a cell of the level, 0..1 (P,L,3). An x outside the cube is moved
+        to its border."""
         place = 0.5 + x * (0.5 / self.half)  # (P,3) over the cube
         place = place.clamp(0, 1 - 1e-6).nan_to_num(0)  # a diverging run ends at its next log line
         place = place[:, None] * self.resolution[:, None]  # (P,L,3) in cells
         index = place.long()  # (P,L,3)
-        octant = ((index & 1) * self.octant_stride).sum(2)  # (P,L)
-        node = (index[:, 0] * self.row_stride).sum(1)  # (P,)
+        octant = number_of(index & 1, 2)  # (P,L)
+        node = number_of(index[:, 0], self.root)  # (P,)
         nodes = [node]
-        exists = [node >= 0]  # level 0 is everywhere
         for level in range(1, self.levels):
             child = self.child.index_select(0, node)  # (P,)
-            exists.append(child > 0)
-            node = torch.where(exists[-1], child + octant[:, level], node)
+            node = torch.where(child > 0, child + octant[:, level], node)
             nodes.append(node)
-        nodes = torch.stack(nodes, 1)
-        exists = torch.stack(exists, 1)
-        return nodes, exists, place.frac()
+        return torch.column_stack(nodes), place.frac()
 
     def forward(self, x):
         """Features (P,LC) at x (P,3)."""
-        node, exists, place = self.locate(x)
+        node, place = self.locate(x)
+        exists = F.pad(node.diff() > 0, (1, 0), value=True)  # (P,L) else it is the level's above
         node = node.flatten()  # (PL,)
         w = corner_weights(place.flatten(0, 1))  # (PL,8)
-        w = w * self.is_free.index_select(0, node)
-        w = w * exists.reshape(-1, 1)
+        w = w * self.is_free.index_select(0, node) * exists.reshape(-1, 1)
         corner = self.corner.index_select(0, node)  # (PL,8)
-        out = WeightedSum.apply(self.features, corner, w)  # (PL,C)
-        return out.reshape(len(x), self.width)
+        return WeightedSum.apply(self.features, corner, w).reshape(len(x), self.width)
 
 
-def nearest_row(sorted_keys, key):
-    """Rows of sorted_keys (V,) where key (...) is, or would be."""
-    return torch.searchsorted(sorted_keys, key).clamp(max=len(sorted_keys) - 1)
+def place_rows(table, is_old):
+    """A table (V,C) with the rows of table (.,C) where is_old (V,), zeros elsewhere."""
+    out = table.new_zeros(len(is_old), table.shape[1])
+    out[is_old] = table
+    return out
 
 
-def carry_rows(table, old_row):
-    """Rows old_row (V,) of a table (.,C), zeros where old_row is -1."""
-    return torch.where(old_row[:, None] >= 0, table[old_row], 0)
-
-
+@torch.no_grad()
 def in_chunks(function, x):
-    """function(x) of points (P,3), a part at a time."""
-    return torch.cat([function(part) for part in x.split(CHUNK)])
+    """function(x) of points (P,3), a part at a time, without gradient."""
+    return torch.cat([function(part) for part in x.split(2**15)])
 
 
-def seed_octree(octree, points, dense, near):
-    """Splits the first `dense` levels everywhere, `near` more around points (P,3), neighbours too,
-    so that no corner of a point's cell is hanging; then random features. [D10]"""
+def seed_octree(octree, points, dense):
+    """Splits the first `dense` levels everywhere, two more around points (P,3), neighbours too, so
+    that no corner of a point's cell is hanging; then random features. [D10]"""
     for _ in range(dense):
         octree.split(octree.cells)
-    step = grid_index(3, points.device) - 1  # (27,3)
-    neighbours = F.pad(step, (1, 0))  # (27,4)
-    for _ in range(near):
-        node, _, _ = octree.locate(points)
+    neighbours = F.pad(grid_index(3, points) - 1, (1, 0))  # (27,4)
+    for _ in range(2):
+        node, _ = octree.locate(points)
         home = octree.cells[node[:, -1].unique()]  # (N,4)
         octree.split(home[:, None] + neighbours)
     nn.init.normal_(octree.features, std=0.01)
 
 
-ERROR_SHARE = 0.8  # of the recorded error lies in the cells that are split
-
-
-@torch.no_grad()
 def worst_cells(octree):
     """The cells (N,4) that should be split: of those whose children are no finer than a pixel, the
     worst, which hold most of the recorded error. [D15]"""
     level = octree.cells[:, 0]  # (N,)
     error, pixel, count = octree.record.unbind(1)  # (N,) sums over rays
-    is_coarse = pixel < count * octree.side(level) / 2  # mean size of a pixel under a child's side
+    is_coarse = pixel < count * octree.side[level] / 2  # mean size of a pixel under a child's side
     can_split = is_coarse & (octree.child == 0) & (level < octree.levels - 1)
     found, worst = (error * can_split).sort(descending=True)  # (N,)
     before = found.cumsum(0) - found  # (N,) what worse cells hold
-    is_chosen = before < ERROR_SHARE * found.sum()
+    is_chosen = before < 0.8 * found.sum()
     room = max(0, MAX_CELLS - len(level)) // 8
     return octree.cells[worst[is_chosen][:room]]
 
 
 # ---- 4 Fields: the networks on top of the octree -------------------------------------------------
 
-SPHERE = 0.25  # radius of the sphere that training starts from [D10]
 GEO = 15  # length of the geometry feature that the SDF network hands to the colour network
 MIXED_ON = {"cuda"}  # devices whose colour and background networks run in bfloat16 [D9]
 
@@ -468,6 +445,14 @@ def mlp(inputs, hidden, outputs):
         nn.Linear(hidden, outputs))
 
 
+def colors_of(network, geo, per_ray):
+    """Colours (R,S,3) that a network reads from geometry (RS,G) and what is the same for all
+    samples of a ray (R,.)."""
+    R = len(per_ray)
+    inputs = torch.hstack([geo, per_ray.repeat_interleave(len(geo) // R, 0)])
+    return mixed_precision(network, inputs).sigmoid().reshape(R, -1, 3)
+
+
 UNIT = 3**-0.5
 TAPS = (  # a point and, at a distance of 1, the corners of a tetrahedron
     (0.0, 0.0, 0.0),
@@ -481,8 +466,7 @@ def finite_differences(s, taps, eps):
     """Gradient (P,3) and Laplacian (P,) of a field from its values s (P,5) at x + eps taps: x
     itself, then the corners of a regular tetrahedron (Neuralangelo's code; its paper has six)."""
     grad = 3 / (4 * eps) * (s @ taps)  # (P,3) as the sum of k k^T over corners k is 4/3 I
-    mean = s[:, 1:].mean(1)
-    lap = 6 / eps**2 * (mean - s[:, 0])
+    lap = 6 / eps**2 * (s[:, 1:].mean(1) - s[:, 0])
     return grad, lap
 
 
@@ -506,10 +490,10 @@ class SDFField(nn.Module):
     def forward(self, x):
         """sdf (P,) and geometry (P,G) at x (P,3)."""
         feat = self.octree(x)  # (P,LC)
-        inputs = torch.cat([x, feat], 1)  # (P,3+LC)
-        change, geo = self.network(inputs).split([1, GEO], 1)  # (P,1), (P,GEO)
-        sdf = x.norm(dim=1) - SPHERE + change[:, 0]  # (P,)
-        return sdf, torch.cat([geo, feat], 1)
+        out = self.network(torch.hstack([x, feat]))  # (P,1+GEO)
+        change, geo = out.tensor_split([1], 1)
+        sdf = x.norm(dim=1) - 0.25 + change[:, 0]  # (P,)
+        return sdf, torch.hstack([geo, feat])
 
     def derivatives(self, x, eps):
         """grad s (P,3) and lap s (P,) at x (P,3), from s there and at four taps, eps away."""
@@ -523,12 +507,10 @@ class LipschitzLinear(nn.Linear):
     bound in the max norm (Liu et al. 2022, who have softplus for exp)."""
     def __init__(self, inputs, outputs):
         super().__init__(inputs, outputs)
-        largest = self.weight.detach().abs().sum(1).max()
-        self.c = nn.Parameter(largest.log())
+        self.c = nn.Parameter(self.weight.data.abs().sum(1).max().log())
 
     def forward(self, x):
-        norm = self.weight.abs().sum(1, keepdim=True)  # (out,1)
-        scale = (self.c.exp() / norm).clamp(max=1)
+        scale = (self.c.exp() / self.weight.abs().sum(1, keepdim=True)).clamp_max(1)  # (out,1)
         return F.linear(x, self.weight * scale, self.bias)
 
 
@@ -539,57 +521,35 @@ def lipschitz_loss(network):
 
 # ---- 5 From SDF to colour: alpha, compositing, samples, background -------------------------------
 
-class Deviation(nn.Module):
-    """The deviation network: zeta = exp(10 v), one learned number; 1/zeta is a surface's width."""
-    def __init__(self, zeta=20.0):
-        super().__init__()
-        self.v = nn.Parameter(torch.tensor(math.log(zeta) / 10))
-
-    def forward(self):
-        return torch.exp(10 * self.v)
-
-    @torch.no_grad()
-    def bound(self, done, most):
-        """Clamps zeta. The floor rises from 15 to 80 in the first 43 % of training (done: 0..1):
-        soft walls hide people from the mask, and people in the picture keep walls soft. Above
-        `most` a wall is far thinner than a section between samples; no gradient moves it. [D14]"""
-        floor = 15 + 65 * min(done / 0.43, 1.0)
-        self.v.clamp_(math.log(floor) / 10, math.log(most) / 10)
-
-
 def neus_alpha(sdf, zeta):
     """Opacity (R,S) of the sections between samples with SDF (R,S+1). Eq. 1, mended:
     alpha_i = max(0, 1 - sigmoid(zeta s_{i+1}) / sigmoid(zeta s_i)) (NeuS Eq. 13) [D1] [D2]"""
     log_phi = F.logsigmoid(zeta * sdf)  # (R,S+1), which does not overflow
-    fall = torch.diff(log_phi).clamp(max=0)  # (R,S) 0 where the ray leads outwards
-    return -torch.expm1(fall)
+    fall = log_phi.diff().clamp_max(0)  # (R,S) 0 where the ray leads outwards
+    return -fall.expm1()
 
 
 def composite(alpha):
-    """Eq. 2: weights w_i = T_i alpha_i (R,S) with T_i = prod_{j<i} (1 - alpha_j); and what passes
-    all sections (R,). By a sum of logs, in which an opaque section counts as passing 1e-6."""
+    """Eq. 2: weights w_i = T_i alpha_i (R,S) with T_i = prod_{j<i} (1 - alpha_j). By a sum of logs,
+    in which an opaque section counts as passing 1e-6."""
     log_passes = torch.log1p((1e-6 - 1) * alpha)  # (R,S) of what passes a section
     trans = torch.exp(log_passes.cumsum(1) - log_passes)  # (R,S) T_i
-    w = trans * alpha
-    return w, 1 - w.sum(1)
+    return trans * alpha
 
 
 def inverse_cdf(edges, weight, u):
     """Positions (R,S) where the linear CDF of weight (R,N) on edges (R,N+1) reaches u (R,S)."""
-    cdf = torch.cumsum(weight, 1)
+    cdf = weight.cumsum(1)
     cdf = F.pad(cdf / cdf[:, -1:], (1, 0))  # (R,N+1)
     right = torch.searchsorted(cdf, u, right=True).clamp(1, weight.shape[1])  # (R,S)
     left = right - 1
     below = cdf.gather(1, left)
     width = cdf.gather(1, right) - below
-    part = (u - below) / width.clamp(min=1e-9)
-    begin = edges.gather(1, left)
-    end = edges.gather(1, right)
-    return torch.lerp(begin, end, part.clamp(0, 1))
+    part = (u - below) / width.clamp_min(1e-9)
+    return edges.gather(1, left).lerp(edges.gather(1, right), part.clamp(0, 1))
 
 
-PROBES = 64  # sections of a ray between cheap lookups of the cached SDF
-UNIFORM_SHARE = 0.2  # of samples, spread evenly, so that a lost surface can return
+EVEN = 0.25  # weight of samples spread evenly, so that a lost surface can return: a fifth of all
 
 
 class SDFCache(nn.Module):
@@ -597,14 +557,12 @@ class SDFCache(nn.Module):
     def __init__(self, n):
         super().__init__()
         self.volume = nn.Buffer(torch.zeros(1, 1, n, n, n))  # x slowest
+        line = torch.linspace(-1, 1, n)
+        self.points = torch.cartesian_prod(line, line, line)  # (P,3)
 
-    @torch.no_grad()
     def refresh(self, sdf):
         """Evaluates sdf, (P,3) to (P,), again."""
-        n = self.volume.shape[-1]
-        line = torch.linspace(-1, 1, n, device=self.volume.device)  # (n,)
-        x = torch.cartesian_prod(line, line, line)  # (P,3)
-        s = in_chunks(sdf, x)  # (P,)
+        s = in_chunks(sdf, self.points)  # (P,)
         self.volume.copy_(s.view_as(self.volume))
 
     def sdf(self, x):
@@ -613,26 +571,23 @@ class SDFCache(nn.Module):
         s = F.grid_sample(self.volume, grid, padding_mode="border", align_corners=True)
         return s[0, 0, 0]
 
-    @torch.no_grad()
     def distances(self, rays, t0, t1, jitter, zeta):
         """Distances (R,S+1) of samples from t0 to t1 (R,1), dense where a surface is seen. jitter:
         (R,S-1) in 0..1, stratifies those between the ends."""
-        share = torch.linspace(0, 1, PROBES + 1, device=t0.device)
-        probes = torch.lerp(t0, t1, share)  # (R,N+1)
-        zeta = zeta.clamp(max=self.volume.shape[-1])  # surfaces at least half a voxel wide
-        alpha = neus_alpha(self.sdf(rays.at(probes)), zeta)  # (R,N)
-        weight, _ = composite(alpha)
-        even = UNIFORM_SHARE / (1 - UNIFORM_SHARE) * weight.mean(1, keepdim=True)
+        share = torch.linspace(0, 1, 65, device=t0.device)
+        probes = t0.lerp(t1, share)  # (R,N+1) where the cache is looked up, which is cheap
+        zeta = zeta.detach().clamp_max(self.volume.shape[-1])  # surfaces at least half a voxel wide
+        weight = composite(neus_alpha(self.sdf(rays.at(probes)), zeta))  # (R,N)
+        even = EVEN * weight.mean(1, keepdim=True)
         n = jitter.shape[1]
         u = (torch.arange(n, device=t0.device) + jitter) / n  # (R,S-1)
         inner = inverse_cdf(probes, weight + even + 1e-5, u)
-        return torch.cat([t0, inner, t1], 1)
+        return torch.hstack([t0, inner, t1])
 
 
 def contract(x):
     """Squeezes |x| > 1 into the ball of radius 2 (mip-NeRF 360 Eq. 10); identity inside."""
-    length = x.norm(dim=-1, keepdim=True)  # (...,1)
-    inverse = 1 / length.clamp(min=1)
+    inverse = 1 / x.norm(dim=-1, keepdim=True).clamp_min(1)  # (...,1)
     return x * (2 - inverse) * inverse
 
 
@@ -641,7 +596,7 @@ class Background(nn.Module):
     def __init__(self, points, hidden, per_ray, levels):
         super().__init__()
         self.octree = Octree(2.0, levels, root=32)
-        seed_octree(self.octree, contract(points), dense=levels - 3, near=2)  # (K,3)
+        seed_octree(self.octree, contract(points), dense=levels - 3)  # (K,3)
         self.density = mlp(3 + self.octree.width, hidden, 1 + GEO)
         self.color = mlp(GEO + per_ray, hidden, 3)
 
@@ -651,28 +606,23 @@ class Background(nn.Module):
         direction and code; jitter (R,S) in 0..1, here S background samples. A sixth of them lies
         evenly before the sphere; the others are even in u, at a distance u / (1 - u) behind it.
         The last is opaque. [D8]"""
-        R, S = jitter.shape
+        _, S = jitter.shape
         n = S // 6
         place = torch.arange(S, device=t0.device) + jitter  # (R,S)
-        before = torch.lerp(rays.near, t0, place[:, :n] / n)  # (R,n)
+        before = rays.near.lerp(t0, place[:, :n] / n)  # (R,n)
         u = (place[:, n:] - n) / (S - n)  # (R,S-n)
-        beyond = u / (1 - u).clamp(min=1e-3)
-        path = torch.cat([before, t0 + beyond], 1)  # (R,S) without the sphere, for lengths
-        t = torch.cat([before, t1 + beyond], 1)  # (R,S)
+        beyond = u / (1 - u).clamp_min(1e-3)
+        path = torch.hstack([before, t0 + beyond])  # (R,S) without the sphere, for lengths
+        t = torch.hstack([before, t1 + beyond])  # (R,S)
         x = contract(rays.at(t)).flatten(0, 1)  # (RS,3)
-        inputs = torch.cat([x, self.octree(x)], 1)  # (RS,3+LC)
-        out = mixed_precision(self.density, inputs)  # (RS,1+GEO)
-        density, geo = out.split([1, GEO], 1)
-        inputs = torch.cat([geo, per_ray.repeat_interleave(S, 0)], 1)  # (RS,GEO+3+A)
-        rgb = mixed_precision(self.color, inputs).sigmoid()
-        rgb = rgb.reshape(R, S, 3)
-        sigma = F.softplus(density.reshape(R, S) - 1)
-        sigma = sigma[:, :-1]  # (R,S-1)
-        alpha = 1 - torch.exp(-sigma * torch.diff(path))
-        alpha = F.pad(alpha, (0, 1), value=1.0)  # (R,S)
-        w, _ = composite(alpha)
+        inputs = torch.hstack([x, self.octree(x)])  # (RS,3+LC)
+        density, geo = mixed_precision(self.density, inputs).tensor_split([1], 1)
+        rgb = colors_of(self.color, geo, per_ray)  # (R,S,3)
+        sigma = F.softplus(density.reshape_as(jitter) - 1)  # (R,S)
+        alpha = 1 - torch.exp(-sigma[:, :-1] * path.diff())  # (R,S-1)
+        w = composite(F.pad(alpha, (0, 1), value=1.0))  # (R,S)
         colors = w[:, :, None] * rgb
-        front, behind = colors.split([n, S - n], 1)
+        front, behind = colors.tensor_split([n], 1)
         passes = 1 - w[:, :n].sum(1, keepdim=True)
         return front.sum(1), passes, behind.sum(1)
 
@@ -682,40 +632,30 @@ def render_rays(model, rays, code, jitter):
     0..1: S - 1 columns for the foreground, then the background's. Returns a dictionary: rgb (R,3);
     opacity (R,); depth (R,) and end (R,3), where the ray ends on average, both without gradient;
     normal (R,3), times opacity, e_grad and e_curv (R,) at that end; t (R,S+1) of the samples."""
-    S = model.cfg.samples
-    zeta = model.deviation()
-    inner, outer = jitter.split([S - 1, model.cfg.bg_samples], 1)
+    zeta = model.zeta()
+    inner, outer = jitter.tensor_split([model.cfg.samples - 1], 1)
     t0, t1 = sphere_interval(rays)  # (R,1)
     t = model.cache.distances(rays, t0, t1, inner, zeta)  # (R,S+1)
-    x = rays.at(t).flatten(0, 1)  # (R(S+1),3)
-    sdf, geo = model.sdf(x)  # (R(S+1),), (R(S+1),G)
-    alpha = neus_alpha(sdf.reshape(t.shape), zeta)  # (R,S)
-    w, trans = composite(alpha)  # (R,S), (R,)
-    at_near_end = F.pad(w, (0, 1))  # (R,S+1)
-    at_far_end = F.pad(w, (1, 0))
-    w = (at_far_end + at_near_end) / 2  # (R,S+1) of samples: mean of the sections beside it [D2]
+    sdf, geo = model.sdf(rays.at(t).flatten(0, 1))  # (R(S+1),), (R(S+1),G)
+    w = composite(neus_alpha(sdf.reshape(t.shape), zeta))  # (R,S)
+    trans = 1 - w.sum(1)  # (R,) what passes all of them
+    w = F.avg_pool1d(w, 2, stride=1, padding=1)  # (R,S+1) mean of the sections beside a sample [D2]
 
     opacity = 1 - trans
-    depth = (w * t).sum(1) + trans * t1[:, 0]
-    depth = depth.detach()  # (R,) a ray that hits nothing ends where it leaves the sphere
+    depth = ((w * t).sum(1) + trans * t1[:, 0]).detach()  # (R,) if it hits nothing: where it leaves
     end = rays.at(depth[:, None])[:, 0]  # (R,3)
     grad, lap = model.sdf.derivatives(end, model.eps)  # (R,3), (R,) [D13]
     normal = F.normalize(grad)
 
-    per_ray = torch.cat([rays.d, code], 1)  # (R,3+A)
-    constants = torch.cat([normal, per_ray], 1)  # (R,3+3+A) the same for all samples of a ray [D13]
-    constants = constants.repeat_interleave(S + 1, 0)
-    inputs = torch.cat([geo, constants], 1)  # (R(S+1),G+3+3+A)
-    rgb = mixed_precision(model.color, inputs).sigmoid()
-    rgb = rgb.reshape(-1, S + 1, 3)
+    per_ray = torch.hstack([rays.d, code])  # (R,3+A)
+    rgb = colors_of(model.color, geo, torch.hstack([normal, per_ray]))  # (R,S+1,3) [D13]
     rgb = torch.einsum("rs,rsc->rc", w, rgb)  # (R,3)
-    if model.background is None:
-        rgb = rgb + trans[:, None] * model.bg_color
-    else:
+    behind = model.bg_color  # (3,)
+    if model.background:
         front, passes, behind = model.background(rays, t0, t1, per_ray, outer)
-        rgb = front + passes * rgb + trans[:, None] * behind
+        rgb = front + passes * rgb
     return dict(
-        rgb=rgb,
+        rgb=rgb + trans[:, None] * behind,
         opacity=opacity,
         depth=depth,
         end=end,
@@ -760,30 +700,26 @@ class CGNet(nn.Module):
     The head reads all three resolutions: at 1/8 alone a mask could not follow an outline."""
     def __init__(self):
         super().__init__()
-        self.stage1 = nn.Sequential(
-            conv(3, 16, stride=2),
-            conv(16, 16, stride=1))
-        self.stage2 = ContextBlock(16, 32, dilation=2)
-        self.stage3 = ContextBlock(32, 64, dilation=4)
-        self.head1 = nn.Conv2d(16, 1, 1)
-        self.head2 = nn.Conv2d(32, 1, 1, bias=False)
-        self.head3 = nn.Conv2d(64, 1, 1, bias=False)
-        nn.init.constant_(self.head1.bias, -2.5)  # starts with 8 % masked, not with half
+        self.stages = nn.Sequential(
+            nn.Sequential(conv(3, 16, stride=2), conv(16, 16, stride=1)),
+            ContextBlock(16, 32, dilation=2),
+            ContextBlock(32, 64, dilation=4))
+        self.heads = nn.Sequential(*[nn.Conv2d(n, 1, 1, bias=n == 16) for n in (16, 32, 64)])
+        nn.init.constant_(self.heads[0].bias, -2.5)  # starts with 8 % masked, not with half
 
     def forward(self, photo):
-        y1 = self.stage1(photo - 0.5)  # (B,16,H/2,W/2)
-        y2 = self.stage2(y1)  # (B,32,H/4,W/4)
-        y3 = self.stage3(y2)  # (B,64,H/8,W/8)
-        size = y1.shape[2:]
-        middle = F.interpolate(self.head2(y2), size, mode="bilinear")
-        coarse = F.interpolate(self.head3(y3), size, mode="bilinear")
-        return self.head1(y1) + middle + coarse  # (B,1,H/2,W/2)
+        size = [(n + 1) // 2 for n in photo.shape[2:]]
+        y = photo - 0.5
+        logits = 0
+        for stage, head in zip(self.stages, self.heads):
+            y = stage(y)  # (B,16,H/2,W/2), (B,32,H/4,W/4), (B,64,H/8,W/8)
+            logits = logits + F.interpolate(head(y), size, mode="bilinear")
+        return logits  # (B,1,H/2,W/2)
 
 
 def sample_logits(logits, uv):
     """Logits (R,) at uv (R,2) in 0..1 of logits (B,1,h,w); rays come photo by photo, R / B each."""
-    grid = 2 * uv - 1
-    grid = grid.reshape(len(logits), -1, 1, 2)  # (B,R/B,1,2)
+    grid = (2 * uv - 1).reshape(len(logits), -1, 1, 2)  # (B,R/B,1,2)
     at = F.grid_sample(logits, grid, padding_mode="border", align_corners=False)
     return at.flatten()
 
@@ -810,12 +746,9 @@ def transient_loss(logit, error, price):
     same M minimises (1 - M) error + M price, but the slope of that vanishes where the sigmoid is
     flat. [D7]"""
     is_transient = (error > price).float()
-    weight = (error - price).abs()
-    return F.binary_cross_entropy_with_logits(logit, is_transient, weight)
+    return F.binary_cross_entropy_with_logits(logit, is_transient, (error - price).abs())
 
 
-REJECTING = 0.3  # share of training in which outliers are rejected [D7]
-LEAST_PRICE = 0.15  # error of a ray below which it is never transient
 TAUGHT = 0.6  # share of training in which the mask learns; longer, it would give people up
 
 
@@ -823,7 +756,7 @@ def reject_outliers(mask, is_outlier, done):
     """M (R,), but 1 for outliers, rays whose error exceeds their price, if M exceeds a bound. That
     rises from 0 to 1 in the first 30 % of training: at first the scene must not learn to paint
     people, later it must learn its details. [D7]"""
-    suspicion = (done / REJECTING) ** 2
+    suspicion = (done / 0.3) ** 2
     return torch.where(is_outlier & (mask > suspicion), 1.0, mask)
 
 
@@ -832,49 +765,39 @@ def follow_quantiles(running, shares, values, is_chosen):
     values (R,): up where too many of them lie above it."""
     is_below = (values[:, None] < running) & is_chosen[:, None]  # (R,Q)
     count = is_chosen.sum()
-    excess = (count * shares - is_below.sum(0)) / count.clamp(min=1)  # (Q,) 0 if none is chosen
+    excess = (count * shares - is_below.sum(0)) / count.clamp_min(1)  # (Q,) 0 if none is chosen
     running *= torch.exp(0.1 * excess)
 
 
-class TransientMask(nn.Module):
+class TransientMask(CGNet):
     """CGNet on small photos, which gives M, and the running quantiles that prices depend on."""
     def __init__(self, scene):
         super().__init__()
-        self.cgnet = CGNet()
         self.thumbs = scene.thumbs
+        self.static = scene.static
         self.shares = torch.tensor([0.5, 0.75, 0.95])
         self.richness = nn.Buffer(torch.tensor([0.5, 1.0, 4.0]))  # (3,) of foreground rays
         self.sfm_error = nn.Buffer(torch.tensor([0.3]))  # (1,) upper quartile at SfM pixels
-        # (I,n,n) which pixels of masks show SfM points; some wrongly, at outlines [D10]
-        n = scene.thumbs.shape[3] // 2
-        static = torch.zeros(len(scene.thumbs), n, n, dtype=torch.bool)
-        uv = scene.track_uv
-        is_seen = ((uv >= 0) & (uv < 1)).all(1)  # (T,)
-        col, row = (uv[is_seen] * n).long().unbind(1)
-        static[scene.track_photo[is_seen].long(), row, col] = True
-        self.static = static
 
     def logits(self, photos):
         """Logits (B,1,m,m) of photos (B,)."""
-        return self.cgnet(self.thumbs[photos] / 255)
+        return self(self.thumbs[photos] / 255)
 
     def is_static(self, rays):
         """Which rays (R,) go through pixels that show SfM points."""
-        pixel = (rays.uv * self.static.shape[1]).long()  # (R,2)
-        col, row = pixel.unbind(1)
+        col, row = (rays.uv * self.static.shape[1]).long().unbind(1)
         return self.static[rays.img, row, col]
 
     def phi(self, richness, opacity):
         """Phi (R,), Eq. 4: opacity times the sigmoid, which is 0.5 at the upper quartile of rays
         that end on the foreground. richness: their complexity. [D3]"""
         p50, p75, p95 = self.richness
-        width = ((p95 - p50) / 4).clamp(min=1e-3)
+        width = ((p95 - p50) / 4).clamp_min(1e-3)
         return opacity * edge_indicator(richness, p75, width)
 
-    def price(self, phi, lam_mask, lam_gpl):
+    def price(self, phi, cfg):
         """The error (R,) above which a ray is transient. [D7]"""
-        price = (lam_mask + self.sfm_error).clamp(min=LEAST_PRICE)
-        return price + lam_gpl * phi
+        return (cfg.lam_mask + self.sfm_error).clamp_min(0.15) + cfg.lam_gpl * phi
 
 
 # ---- 7 The model and its objective ---------------------------------------------------------------
@@ -894,18 +817,19 @@ class GeoNVS(nn.Module):
         super().__init__()
         self.cfg = replace(cfg)  # a copy, as training decides --mask auto
         self.scene = scene
+        # learning rates of networks; of octree features, codes and the mask, which learn faster
+        self.rates = (cfg.lr_net, cfg.lr_grid, cfg.lr_code, 8e-3)
         raw = scene.raw
         levels = cfg.levels
         if levels == 0:  # no cell smaller than a pixel [D15]
             pixels = 2 / raw["footprint"]  # across the sphere; footprint: a pixel's size there
             levels = int(np.clip(1 + np.log2(pixels / ROOT), 2, 8))
-        A = 0
-        if is_on(cfg.appearance, raw["exposure_spread"] > 0.01):
-            A = cfg.appearance_dim
+        has_codes = is_on(cfg.appearance, raw["exposure_spread"] > 0.01)
+        A = cfg.appearance_dim if has_codes else 0
         is_inside = scene.points.norm(dim=1) < 1
         self.sfm = scene.points[is_inside]  # (K,3)
         octree = Octree(1.0, levels)
-        seed_octree(octree, self.sfm, dense=0, near=2)
+        seed_octree(octree, self.sfm, dense=0)
         self.sdf = SDFField(octree, cfg.hidden)
         self.color = nn.Sequential(
             LipschitzLinear(GEO + octree.width + 3 + 3 + A, cfg.hidden),
@@ -918,13 +842,12 @@ class GeoNVS(nn.Module):
         nn.init.normal_(self.appearance.weight, std=0.01)
         self.octrees = [octree]
         self.background = None
-        self.bg_color = torch.tensor(np.nan_to_num(raw["bg_color"], nan=0.5).tolist())
-        is_varied = np.isnan(raw["bg_color"]).any()  # nan: there is no one colour
-        if is_on(cfg.background, is_varied):
-            points = scene.points[~is_inside]
-            self.background = Background(points, cfg.hidden, 3 + A, min(levels, 4))
+        self.bg_color = torch.tensor(raw["bg_color"].tolist()).nan_to_num(0.5)
+        if is_on(cfg.background, np.isnan(raw["bg_color"]).any()):  # nan: there is no one colour
+            self.background = Background(
+                scene.points[~is_inside], cfg.hidden, 3 + A, min(levels, 4))
             self.octrees.append(self.background.octree)
-        self.deviation = Deviation()
+        self.v = nn.Parameter(torch.tensor(math.log(20) / 10))
         self.mask = TransientMask(scene)
         self.cache = SDFCache(64 if levels < 4 else 128)  # as fine as the octree, within bounds
         self.cache.refresh(self.distance)
@@ -934,6 +857,10 @@ class GeoNVS(nn.Module):
     def eps(self):
         """Length of the taps of finite differences: half of the finest cell there is."""
         return self.sdf.octree.finest / 2
+
+    def zeta(self):
+        """The deviation network: one learned number v; 1 / zeta is the width of a wall."""
+        return torch.exp(10 * self.v)
 
     def distance(self, x):
         """s (P,) at x (P,3)."""
@@ -952,14 +879,14 @@ class GeoNVS(nn.Module):
 
         error = residual.detach().amax(1)  # (R,) of the worst channel
         is_static = self.mask.is_static(rays)  # (R,)
-        richness = complexity(out["e_grad"], out["e_curv"]).detach()  # (R,)
-        phi = self.mask.phi(richness, out["opacity"].detach())  # (R,)
+        richness = complexity(out["e_grad"], out["e_curv"])  # (R,)
+        phi = self.mask.phi(richness, out["opacity"]).detach()  # (R,)
         mask = torch.zeros_like(error)
         l_mask = 0.0
         if cfg.mask != "off":
             logit = sample_logits(self.mask.logits(photos), rays.uv)  # (R,)
             mask = logit.detach().sigmoid()
-            price = self.mask.price(phi, cfg.lam_mask, cfg.lam_gpl)
+            price = self.mask.price(phi, cfg)
             dynamic = error * ~is_static  # (R,) SfM pixels: M = 0 [D10]
             if done < TAUGHT:
                 l_mask = transient_loss(logit, dynamic, price)
@@ -970,16 +897,15 @@ class GeoNVS(nn.Module):
         sample = rays.at(t)[::2, 0]  # (N,3) a random one of every second ray [D13]
         sfm = self.sfm[random_index(gen, len(self.sfm), len(sample))]  # (N,3)
         grad, _ = self.sdf.derivatives(sample, self.eps)  # (N,3)
-        s_sfm = self.distance(sfm)  # (N,)
-        pull = self.deviation().detach().clamp(max=40)  # [D10]
+        pull = self.zeta().detach().clamp_max(40)  # [D10]
 
         terms = dict(
-            mse=residual.detach().square().mean(),  # for the log
+            mse=residual.square().mean(),  # for the log
             rgb=((1 - mask) * residual.mean(1)).mean(),
             eik=(out["e_grad"].mean() + eikonal(grad).mean()) / 2,
             curv=out["e_curv"].mean(),  # [D4]
             lps=lipschitz_loss(self.color),
-            sfm=pull * s_sfm.abs().mean(),
+            sfm=pull * self.distance(sfm).abs().mean(),
             mask=mask.mean(),  # for the log, like gpl: rejected rays count as 1
             gpl=gpl_loss(mask, phi))
         total = (
@@ -993,54 +919,53 @@ class GeoNVS(nn.Module):
         return total, terms, out
 
     def before_step(self, step, done):
-        """Keeps zeta within its bounds and the cache up to date. done: 0..1."""
-        self.deviation.bound(done, most=32 * self.cfg.samples)  # a wall of 1/64 of an even section
+        """Keeps the cache up to date and zeta within bounds. Its floor rises from 15 to 80 in the
+        first 43 % of training (done: 0..1): soft walls hide people from the mask, and people in the
+        picture keep walls soft. The other bound is a wall of 1/64 of an even section between
+        samples; no gradient would move a thinner one. [D14]"""
+        floor = 15 + 65 * min(done / 0.43, 1.0)
+        most = 32 * self.cfg.samples
+        self.v.data.clamp_(math.log(floor) / 10, math.log(most) / 10)
         if step % 64 == 0:
             self.cache.refresh(self.distance)
 
-    @torch.no_grad()
     def observe(self, rays, out):
         """Remembers what refining and the mask's prices depend on."""
         prices = self.mask
-        quartile = prices.shares[1:2]
         is_solid = out["opacity"] > 0.5  # (R,)
         follow_quantiles(prices.richness, prices.shares, out["richness"], is_solid)
-        follow_quantiles(prices.sfm_error, quartile, out["error"], out["is_static"])
+        follow_quantiles(prices.sfm_error, 0.75, out["error"], out["is_static"])
         pixel = out["depth"] / self.scene.K[rays.img, 0]  # (R,) its size at the ray's end
         error = (1 - out["mask"]) * out["error"]
-        columns = torch.stack([error, pixel, torch.ones_like(error)], 1)  # (R,3)
+        columns = torch.column_stack([error * is_solid, pixel * is_solid, is_solid])  # (R,3)
         octree = self.sdf.octree
-        node, _, _ = octree.locate(out["end"])
-        octree.record.index_add_(0, node[:, -1], is_solid[:, None] * columns)
+        node, _ = octree.locate(out["end"])
+        octree.record.index_add_(0, node[:, -1], columns)
 
     def batch(self, photos, n, gen):
         """n random rays and the photos (B,) they come from, photo by photo."""
-        which = random_index(gen, len(photos), self.cfg.photos)
-        picked = photos[which]  # (B,)
+        picked = photos[random_index(gen, len(photos), self.cfg.photos)]  # (B,)
         img = picked.repeat_interleave(n // len(picked))  # (R,)
         return random_rays(self.scene, img, gen), picked
 
     def groups(self):
-        """Optimiser groups: networks; octree features, codes and the mask, which learn faster."""
+        """Optimiser groups, in the order of rates."""
         grids = [octree.features for octree in self.octrees]
         codes = [self.appearance.weight]
         mask = list(self.mask.parameters())
         special = set(grids + codes + mask)
         networks = [p for p in self.parameters() if p not in special]
-        return [
-            dict(params=networks, lr=self.cfg.lr_net),
-            dict(params=grids, lr=self.cfg.lr_grid),
-            dict(params=codes, lr=self.cfg.lr_code),
-            dict(params=mask, lr=8e-3)]
+        return [dict(params=group) for group in (networks, grids, codes, mask)]
 
     def refine(self, optimizer):
         """Splits cells where colours err; Adam's moments move along with their features. [D15]"""
         octree = self.sdf.octree
-        cells = from_first_process(worst_cells(octree).cpu())
+        if RANKS > 1:
+            dist.all_reduce(octree.record)
         state = optimizer.state.pop(octree.features)
-        old_row = octree.split(cells.to(octree.cells.device))
+        is_old = octree.split(worst_cells(octree))
         for name in ("exp_avg", "exp_avg_sq"):
-            state[name] = carry_rows(state[name], old_row)
+            state[name] = place_rows(state[name], is_old)
         optimizer.state[octree.features] = state
         optimizer.param_groups[1]["params"][0] = octree.features  # see groups
 
@@ -1058,11 +983,18 @@ class GeoNVS(nn.Module):
         """Appearance codes (I,A) of all photos."""
         return self.appearance.weight.detach()
 
+    def surface_color(self, x):
+        """Colours (P,3) of surface points (P,3), seen along their normals under the mean code."""
+        grad, _ = self.sdf.derivatives(x, self.eps)
+        normal = F.normalize(grad)
+        code = mean_code(self).expand(len(x), -1)
+        _, geo = self.sdf(x)
+        return self.color(torch.hstack([geo, normal, -normal, code])).sigmoid()
+
     def render(self, rays, code):
         """render_rays without jitter, for pictures and for fitting codes."""
         draws = self.cfg.samples - 1 + self.cfg.bg_samples
-        jitter = code.new_full((len(code), draws), 0.5)
-        return render_rays(self, rays, code, jitter)
+        return render_rays(self, rays, code, code.new_full((len(code), draws), 0.5))
 
 
 # ---- 8 Energy ------------------------------------------------------------------------------------
@@ -1073,48 +1005,45 @@ def open_counter(device):
     check(device.type == "cuda", "only GPUs are metered")
     import pynvml
     pynvml.nvmlInit()
-    gpus = []
-    for number in range(device.index, device.index + RANKS):  # this is the first process's
-        uuid = torch.cuda.get_device_properties(number).uuid
-        gpus.append(pynvml.nvmlDeviceGetHandleByUUID(f"GPU-{uuid}"))
+    gpus = [
+        pynvml.nvmlDeviceGetHandleByUUID(f"GPU-{torch.cuda.get_device_properties(number).uuid}")
+        for number in range(RANKS)]  # the first process has the first GPU
     return lambda: sum(map(pynvml.nvmlDeviceGetTotalEnergyConsumption, gpus)) / 1e3  # mJ
 
 
-class EnergyMeter:
-    """Joules counted from tick to tick, on top of those given; None, never 0, once a counter has
-    failed. A counter that starts again from zero between two ticks loses what it counted there."""
-    def __init__(self, device, joules=0.0):
-        self.device = device
-        self.joules = joules
-        self.counter = None
-
-    def tick(self):
-        """Adds what was spent since the last tick. A failing counter ends metering, not the run."""
-        if self.joules is None:
-            return
-        try:
-            if self.counter is None:
-                self.counter = open_counter(self.device)
-                self.last = self.counter()
-            now = self.counter()
-            self.joules += max(0.0, now - self.last)
-            self.last = now
-        except Exception as error:  # a package, a driver's answer or a permission is missing
-            print(f"  energy is null ({error}); on a GPU: pip install nvidia-ml-py")
-            self.joules = None
+def metered_joules(device, joules):
+    """Yields the joules spent until then, on top of those given; ends once a counter has failed,
+    which ends metering, not the run. A counter that starts again from zero between two readings
+    loses what it counted there."""
+    try:
+        counter = open_counter(device)
+        last = counter()
+        while joules is not None:
+            yield joules
+            now = counter()
+            joules += max(0.0, now - last)
+            last = now
+    except Exception as error:  # a package, a driver's answer or a permission is missing
+        print(f"  energy is null ({error}); on a GPU: pip install nvidia-ml-py")
 
 
 # ---- 9 Training ----------------------------------------------------------------------------------
 
 REFINE_AT = (0.1, 0.2, 0.3, 0.45, 0.6)  # shares of training at which the octree is refined
 PAUSE = 30  # seconds between lines of the log; a checkpoint is made with each
-START = dict(step=0, seconds=0.0, joules=0.0)  # what a run has done so far
 RESULTS = ("checkpoint.pt", "log.jsonl", "metrics.json", "panel.png", "mesh.ply", "film.mp4")
 # torchrun starts RANKS processes. Each draws its own rays and follows its own prices, the gradients
 # are averaged, the first process decides, speaks and writes; so all hold the same weights.
 RANK = int(os.environ.get("RANK", 0))
-LOCAL_RANK = int(os.environ.get("LOCAL_RANK", 0))
 RANKS = int(os.environ.get("WORLD_SIZE", 1))
+
+
+@dataclass
+class State:
+    """What a run has done so far."""
+    step: int = 0
+    seconds: float = 0.0
+    joules: float = 0.0
 
 
 def from_first_process(value):
@@ -1144,8 +1073,8 @@ def training_step(model, optimizer, photos, step, done, gen):
         average_gradients(model)
     warm_up = min(1, (step + 1) / 20)
     decay = 0.525 + 0.475 * math.cos(math.pi * done)
-    for group, full in zip(optimizer.param_groups, model.groups()):
-        group["lr"] = warm_up * decay * full["lr"]
+    for group, rate in zip(optimizer.param_groups, model.rates):
+        group["lr"] = warm_up * decay * rate
     optimizer.step()
     model.observe(rays, out)
     return terms
@@ -1154,8 +1083,8 @@ def training_step(model, optimizer, photos, step, done, gen):
 def share_done(cfg, state):
     """Share of training that is done, of steps or minutes; 1 or more: it is over."""
     if cfg.minutes > 0:
-        return state["seconds"] / (60 * cfg.minutes)
-    return state["step"] / cfg.steps
+        return state.seconds / (60 * cfg.minutes)
+    return state.step / cfg.steps
 
 
 def make_optimizer(model):
@@ -1164,13 +1093,13 @@ def make_optimizer(model):
 
 def save_checkpoint(path, model, optimizer, gen, state):
     saved = dict(
-        config=asdict(model.cfg),
+        config=vars(model.cfg),
         scene=model.scene.info,
         octrees=[octree.split_keys for octree in model.octrees],
         model=model.state_dict(),
         optimizer=optimizer.state_dict(),
         generator=gen.get_state(),
-        state=state)
+        state=vars(state))
     buffer = io.BytesIO()  # as torch.save calls a full disk a RuntimeError
     torch.save(saved, buffer)
     atomic_write(path, lambda part: part.write_bytes(buffer.getbuffer()))
@@ -1183,27 +1112,25 @@ def read_checkpoint(path, given):
           "name the run by the --data, --seed and --name that it was made with")
     try:
         data_prep.refuse_bomb(path)
-        saved = torch.load(path, map_location="cpu", weights_only=True)
-        check(isinstance(saved, dict), "no dictionary")
-        cfg = Config(**saved["config"])
-        check(saved["state"].keys() == START.keys(), "state")
+        saved = dict(torch.load(path, map_location="cpu", weights_only=True))
+        return saved, Config(**saved["config"] | given)
     except Exception as error:  # a damaged file can fail in any layer: zip, pickle, tensor storage
         raise UserError(f"{path} is damaged, too large for the memory or of another program "
                         f"({type(error).__name__}): train again under another --name") from None
-    return saved, replace(cfg, **given)
 
 
 def restore(saved, path, model, gen):
-    """Puts a checkpoint's weights into a model and its state into gen; returns its optimiser."""
+    """Puts a checkpoint's weights into a model; returns its optimiser and State."""
     try:
         check(saved["scene"] == model.scene.info, "another scene or split")
         for octree, keys in zip(model.octrees, saved["octrees"], strict=True):
-            octree.build(keys.to(octree.features.device))
+            octree.build(keys.to(gen.device))
         model.load_state_dict(saved["model"])
         optimizer = make_optimizer(model)
         optimizer.load_state_dict(saved["optimizer"])
-        gen.set_state(saved["generator"])
-        return optimizer
+        if RANK == 0:  # the others go on with rays of their own
+            gen.set_state(saved["generator"])
+        return optimizer, State(**saved["state"])
     except Exception as error:  # as in read_checkpoint
         raise UserError(f"{path} does not fit this scene and these settings ({error!r:.90}): use "
                         "flags and kind of device as it was made with, or another --name") from None
@@ -1214,75 +1141,66 @@ def train(cfg, scene, run, saved=None, kind=GeoNVS):
     checkpoint to go on from; kind: GeoNVS, or a rival with its methods. Returns model and state."""
     torch.set_flush_denormal(True)  # vanishing weights would otherwise slow a CPU down
     torch.manual_seed(cfg.seed)
-    gen = torch.Generator(scene.c2w.device).manual_seed(cfg.seed)
-    with torch.device(gen.device):
+    gen = torch.Generator(scene.c2w.device).manual_seed(cfg.seed + RANK)
+    with gen.device:
         model = kind(cfg, scene)
     path = run / "checkpoint.pt"
     if saved is None:
         for name in RESULTS:  # nothing of a former run may be taken for this one's
             (run / name).unlink(missing_ok=True)
         optimizer = make_optimizer(model)
-        state = dict(START)
+        state = State()
     else:
-        optimizer = restore(saved, path, model, gen)
-        state = saved["state"]
-    if RANKS > 1:
-        for value in model.state_dict().values():
-            dist.broadcast(value, 0)
-        gen.manual_seed(cfg.seed + RANK + RANKS * state["step"])  # own rays for each process
-    meter = EnergyMeter(gen.device, state["joules"])
-    meter.tick()
+        optimizer, state = restore(saved, path, model, gen)
+    meter = metered_joules(gen.device, state.joules)
+    next(meter, None)  # it counts from here
     photos = scene.photos(False)
-    begin = time.perf_counter() - state["seconds"]
+    begin = time.perf_counter() - state.seconds
     next_log = 0.0
-    before = share_done(cfg, state)
-    terms = {}
-    while True:
+    done = share_done(cfg, state)
+    while done < 1:
+        terms = training_step(model, optimizer, photos, state.step, done, gen)
+        state.step += 1
         # several processes agree on time now and then, and at the last step
-        if RANKS == 1 or state["step"] % 16 == 0 or state["step"] == cfg.steps:
-            state["seconds"] = from_first_process(time.perf_counter() - begin)
+        if RANKS == 1 or state.step % 16 == 0 or state.step == cfg.steps:
+            state.seconds = from_first_process(time.perf_counter() - begin)
+        before = done
         done = share_done(cfg, state)
-        if terms and any(before < share <= done for share in REFINE_AT):
+        if any(before < share <= done for share in REFINE_AT):
             model.refine(optimizer)
         if before < TAUGHT <= done:
             model.decide_mask()
-        before = done
-        is_due = done >= 1 or state["seconds"] >= next_log
-        if RANK == 0 and terms and is_due:
-            next_log = state["seconds"] + PAUSE
-            meter.tick()
-            state["joules"] = meter.joules
+        is_due = done >= 1 or state.seconds >= next_log
+        if RANK == 0 and is_due:
+            next_log = state.seconds + PAUSE
+            state.joules = next(meter, None)  # None, never 0, once a counter has failed
             report(model, run / "log.jsonl", done, state, terms)
             save_checkpoint(path, model, optimizer, gen, state)
-        if done >= 1:
-            return model, state
-        terms = training_step(model, optimizer, photos, state["step"], done, gen)
-        state["step"] += 1
+    return model, state
 
 
 def report(model, path, done, state, terms):
     """A line on the terminal and one in log.jsonl. psnr: of the step's rays, people included."""
-    is_sound = all(p.isfinite().all() for p in model.parameters())
-    check(is_sound, "the loss is no longer finite: mend poses, or try a third of the learning "
-          f"rates --lr_grid and --lr_net; checkpoint.pt beside {path} is from before")
+    check(all(p.isfinite().all() for p in model.parameters()),
+          "the loss is no longer finite: mend poses, or try a third of the learning rates "
+          f"--lr_grid and --lr_net; checkpoint.pt beside {path} is from before")
     numbers = {key: value.item() for key, value in terms.items()}
     numbers["psnr"] = -10 * math.log10(max(numbers["mse"], 1e-10))
     with open(path, "a") as file:
-        print(json.dumps(state | numbers), file=file)
-    print(f"  {done:4.0%}  step {state['step']}  psnr {numbers['psnr']:.2f}", flush=True)
+        print(json.dumps(vars(state) | numbers), file=file)
+    print(f"  {done:4.0%}  step {state.step}  psnr {numbers['psnr']:.2f}", flush=True)
 
 
 # ---- 10 Scoring, mesh, pictures ------------------------------------------------------------------
 
 def to_uint8(picture):
     """Numbers in 0..1, numpy or torch, as bytes in numpy."""
-    levels = np.asarray(picture).clip(0, 1) * 255
-    return (levels + 0.5).astype(np.uint8)
+    return (np.asarray(picture).clip(0, 1) * 255 + 0.5).astype(np.uint8)
 
 
 def psnr(a, b):
     """Peak signal-to-noise ratio in dB of two pictures in 0..1, numpy or torch; at most 100."""
-    error = float(((a - b) ** 2).mean())
+    error = ((a - b) ** 2).mean()
     return -10 * math.log10(max(error, 1e-10))
 
 
@@ -1314,62 +1232,56 @@ def fit_codes(model, scene, photos, steps=128, n=64):
     for step in progress(range(steps), "fitting the light of held-out photos"):
         adam.param_groups[0]["lr"] = 0.1 * 0.1 ** (step / steps)
         rays = random_rays(scene, img, gen, part=0.5)
-        out = model.render(rays, codes.repeat_interleave(n, 0))
-        loss = (out["rgb"] - rays.rgb).abs().mean()
-        codes.grad, = torch.autograd.grad(loss, codes)
+        rgb = model.render(rays, codes.repeat_interleave(n, 0))["rgb"]
+        loss = (rgb - rays.rgb).abs().mean()
+        [codes.grad] = torch.autograd.grad(loss, codes)
         adam.step()
     return codes.detach()
 
 
 def photo_rays(scene, photo):
     """The rays of all pixels of a photo, row by row."""
-    w, h = scene.wh[photo].tolist()
-    pixel = torch.arange(w * h, device=scene.wh.device)
+    pixel = torch.arange(scene.wh[photo].prod(), device=scene.wh.device)
     return make_rays(scene, torch.full_like(pixel, photo), pixel)
 
 
 @torch.no_grad()
 def render_photo(model, scene, photo, code):
-    """A photo's view under an appearance code (A,): rgb, truth and normal (H,W,3)."""
+    """A photo's view under an appearance code (A,): its colours, the photo itself and normals, in
+    one array (3,H,W,3)."""
     w, h = scene.wh[photo].tolist()
     columns = [column.split(1024) for column in photo_rays(scene, photo)]
     parts = []
     for rays in map(Rays, *columns):
         out = model.render(rays, code.expand(len(rays.o), -1))
-        parts.append(torch.cat([out["rgb"], rays.rgb, out["normal"]], 1))  # (R,9)
-    picture = torch.cat(parts).reshape(h, w, 9)
-    rgb, truth, normal = np.split(picture.cpu().numpy(), 3, axis=2)
-    return dict(rgb=rgb, truth=truth, normal=normal)
+        parts.append(torch.stack([out["rgb"], rays.rgb, out["normal"]]))  # (3,R,3)
+    return torch.cat(parts, 1).reshape(3, h, w, 3).cpu().numpy()
 
 
-def score(frame, lpips=None):
+def score(rgb, truth, lpips=None):
     """The right half of a rendered photo [D12], rounded to 8 bits, against the truth, beside the
     trivial predictor: the mean colour of each row of the left half. SSIM: Gaussian window of 11 px,
     sigma 1.5, no border. None where a picture is too small."""
-    truth = frame["truth"]
     half = truth.shape[1] // 2
     want = truth[:, half:]
-    got = to_uint8(frame["rgb"][:, half:]) / np.float32(255)
-    flat = truth[:, :half].mean(1, keepdims=True)
+    got = to_uint8(rgb[:, half:]) / np.float32(255)
     side = min(got.shape[:2])
     row = dict(
         psnr=psnr(got, want),
-        psnr_floor=psnr(flat, want),
+        psnr_floor=psnr(truth[:, :half].mean(1, keepdims=True), want),
         ssim=None,
         lpips=None)
     if side >= 11:
-        ssim = structural_similarity(
+        row["ssim"] = float(structural_similarity(
             got,
             want,
             channel_axis=2,
             data_range=1,
             gaussian_weights=True,
-            use_sample_covariance=False)
-        row["ssim"] = float(ssim)
+            use_sample_covariance=False))
     if lpips and side >= 32:
-        a = torch.tensor(got).permute(2, 0, 1)  # (3,H,W)
-        b = torch.tensor(want).permute(2, 0, 1)
-        row["lpips"] = lpips(a[None], b[None], normalize=True).item()
+        a, b = [torch.tensor(x).permute(2, 0, 1)[None] for x in (got, want)]  # (1,3,H,W)
+        row["lpips"] = lpips(a, b, normalize=True).item()
     return row
 
 
@@ -1382,14 +1294,14 @@ def evaluate(model, scene, lpips=None):
         codes[some] = fit_codes(model, scene, some)
     rows = []
     for photo in progress(photos.tolist(), "scoring held-out photos"):
-        frame = render_photo(model, scene, photo, codes[photo])
-        row = score(frame, lpips)
-        row["name"] = str(scene.raw["name"][photo])
+        rgb, truth, _ = render_photo(model, scene, photo, codes[photo])
+        row = score(rgb, truth, lpips)
+        row["name"] = scene.raw["name"][photo]
         rows.append(row)
     scores = dict(per_image=rows)
     for key in ("psnr", "psnr_floor", "ssim", "lpips"):
         values = [row[key] for row in rows if row[key] is not None]
-        scores[key] = float(np.mean(values)) if values else None
+        scores[key] = np.mean(values) if values else None
     return scores, codes
 
 
@@ -1400,34 +1312,30 @@ def toy_truth(model, scene):
     against the true occluders of training photos, and mean M on all other pixels; None without a
     mask."""
     raw = scene.raw
-    names = ("near_wall", "near_wall_sdf", "wall", "wall_normal")
-    near, sdf, wall, normal = [torch.as_tensor(raw[name]).to(scene.c2w) for name in names]
-    error = (in_chunks(model.distance, near) - sdf).abs()
+    near, sdf, wall, normal = [
+        torch.as_tensor(raw[name]).to(scene.c2w)
+        for name in ("near_wall", "near_wall_sdf", "wall", "wall_normal")]
     grad, _ = model.sdf.derivatives(wall, 0.004)
     cos = F.cosine_similarity(grad, normal).clamp(-1, 1)
     truth = dict(
-        sdf_error=error.mean().item(),
+        sdf_error=(in_chunks(model.distance, near) - sdf).abs().mean().item(),
         normal_error=cos.acos().rad2deg().median().item(),
         mask_iou=None,
         mask_static=None)
     if model.cfg.mask == "off":
         return truth
-    masks = []
-    for photo in scene.photos(False).tolist():
-        logits = model.mask.logits([photo])
-        M = sample_logits(logits, photo_rays(scene, photo).uv).sigmoid()
-        masks.append(M.cpu().numpy())
-    mask = np.concatenate(masks)
-    is_training = np.repeat(~raw["is_test"], np.diff(raw["start"]))  # by pixel
-    people = raw["occluder"][is_training]
+    masks = [
+        sample_logits(model.mask.logits([photo]), photo_rays(scene, photo).uv).sigmoid()
+        for photo in scene.photos(False).tolist()]
+    mask = torch.cat(masks).cpu().numpy()
+    people = raw["occluder"][np.repeat(~raw["is_test"], np.diff(raw["start"]))]  # by pixel
     truth["mask_static"] = float(mask[~people].mean())
     if people.any():
         found = mask > 0.5
-        truth["mask_iou"] = float((found & people).sum() / (found | people).sum())
+        truth["mask_iou"] = (found & people).sum() / (found | people).sum()
     return truth
 
 
-@torch.no_grad()
 def extract_mesh(model):
     """The surface s = 0, cut open at the unit sphere, by marching cubes with two cells per finest
     octree cell, at most 512: vertices (P,3) in SfM units, faces (F,3), colours (P,3) uint8 as seen
@@ -1435,32 +1343,19 @@ def extract_mesh(model):
     gives its sign."""
     n = min(round(2 / model.eps), 512)
     cache = model.cache.volume
-    volume = F.interpolate(cache, size=n + 1, mode="trilinear", align_corners=True)[0, 0]
+    volume = F.interpolate(cache, n + 1, mode="trilinear", align_corners=True)[0, 0]
     near = volume.abs() < 6 / cache.shape[-1]
-    x = near.nonzero() * (2 / n) - 1  # (P,3)
-    volume[near] = in_chunks(model.distance, x)
+    volume[near] = in_chunks(model.distance, near.nonzero() * (2 / n) - 1)
     volume = volume.cpu().numpy()
     square = np.linspace(-1, 1, n + 1) ** 2
     is_inside = square[:, None, None] + square[:, None] + square < 1  # (n+1,n+1,n+1)
     if len(np.unique(volume[is_inside] < 0)) < 2:
-        empty = np.zeros((0, 3))
-        return empty, empty, empty
+        return [np.zeros((0, 3))] * 3
     vertices, faces, _, _ = marching_cubes(volume, 0, mask=is_inside)
     vertices = vertices * (2 / n) - 1
-    x = torch.tensor(vertices, device=cache.device)
-    colors = in_chunks(lambda part: surface_color(model, part), x)
+    colors = in_chunks(model.surface_color, torch.tensor(vertices).to(cache))
     raw = model.scene.raw
     return vertices * raw["scale"] + raw["center"], faces, to_uint8(colors.cpu())
-
-
-def surface_color(model, x):
-    """Colours (P,3) of surface points (P,3), seen along their normals under the mean code."""
-    grad, _ = model.sdf.derivatives(x, model.eps)
-    normal = F.normalize(grad)
-    code = mean_code(model).expand(len(x), -1)
-    _, geo = model.sdf(x)
-    inputs = torch.cat([geo, normal, -normal, code], 1)
-    return model.color(inputs).sigmoid()
 
 
 def write_ply(path, vertices, faces, colors):
@@ -1487,94 +1382,87 @@ end_header
     atomic_write(path, write)
 
 
-def write_panel(path, model, scene, codes, width=240):
+def write_panel(path, model, scene, codes):
     """A row for two held-out photos and two of training: photo, render under codes (I,A), normals
     of the surface, and what the mask network says of the photo."""
-    photos = torch.cat([scene.photos(True)[:2], scene.photos(False)[:2]])
     rows = []
-    for photo in photos.tolist():
-        frame = render_photo(model, scene, photo, codes[photo])
-        tiles = [frame["truth"], frame["rgb"], frame["normal"] / 2 + 0.5]
+    for photo in scene.photos(True)[:2].tolist() + scene.photos(False)[:2].tolist():
+        rgb, truth, normal = render_photo(model, scene, photo, codes[photo])
+        tiles = [truth, rgb, normal / 2 + 0.5]
         kind = "held out" if scene.is_test[photo] else "training"
         text = f"{kind}: {scene.raw['name'][photo]}, render, normals"
         if model.cfg.mask != "off":
             M = model.mask.logits([photo])[0, 0].detach().sigmoid().cpu()  # (m,m)
-            tiles.append(np.dstack([M, M, M]))
+            tiles.append(np.dstack([M] * 3))
             text += ", mask (white: transient)"
-        h, w = frame["rgb"].shape[:2]
-        size = (width, width * h // w)
+        h, w, _ = rgb.shape
+        size = (240, 240 * h // w)
         row = [cv2.resize(to_uint8(tile), size, interpolation=cv2.INTER_AREA) for tile in tiles]
         row = np.pad(np.hstack(row), ((20, 0), (0, 0), (0, 0)), constant_values=255)
         cv2.putText(row, text, (2, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.4, (0, 0, 0))
         rows.append(row)
-    picture = np.vstack(rows)[:, :, ::-1]
-    atomic_write(path, lambda part: cv2.imwrite(str(part), picture))
+    atomic_write(path, lambda part: cv2.imwrite(str(part), np.vstack(rows)[:, :, ::-1]))
 
 
 def finish(model, scene, state, run):
     """Scores a trained model and writes metrics.json, panel.png and mesh.ply below run."""
-    device = scene.c2w.device
     unit = 1 if sys.platform == "darwin" else 1024  # bytes
     peak = unit * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss  # before scoring
     machine = f"cpu, {torch.get_num_threads()} threads"
-    if device.type == "cuda":
-        peak = torch.cuda.max_memory_allocated(device)
-        machine = torch.cuda.get_device_name(device)
+    if scene.c2w.is_cuda:
+        peak = torch.cuda.max_memory_allocated()
+        machine = torch.cuda.get_device_name()
     scores, codes = evaluate(model, scene, make_lpips())
     write_panel(run / "panel.png", model, scene, codes)
     if isinstance(model, GeoNVS):
-        level = model.sdf.octree.cells[:, 0]
-        scores["octree_cells"] = level.bincount().tolist()  # by level
+        scores["octree_cells"] = model.sdf.octree.cells[:, 0].bincount().tolist()  # by level
         write_ply(run / "mesh.ply", *extract_mesh(model))
-        if scene.info["kind"] == "toy":
+        if "wall" in scene.raw:  # the toy
             scores |= toy_truth(model, scene)
-    joules = state["joules"]
+    joules = state.joules
     is_metered = joules is not None
     parameters = sum(p.numel() for p in model.parameters())
-    cells = sum(len(octree.cells) for octree in model.octrees)
-    here = Path(__file__).parent
-    status, commit = subprocess.getstatusoutput(f'git -C "{here}" describe --always --dirty')
+    status, commit = subprocess.getstatusoutput(
+        f'git -C "{Path(__file__).parent}" describe --always --dirty')
     metrics = scores | dict(
         scene=scene.info["scene"],
         method=model.name,
         seed=model.cfg.seed,
-        steps=state["step"],
+        steps=state.step,
         device=machine,
-        train_seconds=state["seconds"],
+        train_seconds=state.seconds,
         energy_wh=joules / 3600 if is_metered else None,
         energy_source=f"the device's counter, read every {PAUSE} s" if is_metered else None,
-        rays_per_second=state["step"] * model.cfg.rays / state["seconds"],
+        rays_per_second=state.step * model.cfg.rays / state.seconds,
         parameters=parameters,
-        model_bytes=4 * parameters + 44 * cells,  # a cell: child, 8 corners, 8 flags
+        # a cell: child, 8 corners, 8 flags
+        model_bytes=4 * parameters + 44 * sum(len(octree.cells) for octree in model.octrees),
         peak_memory_bytes=peak,
         protocol="appearance fitted on the left half, scored on the right half",
         torch=torch.__version__,
         commit=None if status else commit,
-        config=asdict(model.cfg))
+        config=vars(model.cfg))
     atomic_write(run / "metrics.json", lambda part: part.write_text(json.dumps(metrics, indent=1)))
     return metrics
 
 
-def film(model, scene, path, frames=96):
+def film(model, scene, path):
     """mp4 at 24 frames/s: the first training camera sways sideways, by a tenth of the sphere's
     radius, while its photo's light turns into the last photo's."""
     photos = scene.photos(False)[[0, -1]]
     first, last = model.codes()[photos]  # (A,)
     photo = photos[0].item()
-    scene = scene._replace(c2w=scene.c2w.clone())
-    camera = scene.c2w[photo]  # (3,4), a part of the copy
-    position = camera[:, 3].clone()
     w, h = (scene.wh[photo] // 2 * 2).tolist()  # codecs want even sides
 
     def write(part):
-        codec = cv2.VideoWriter_fourcc(*"mp4v")
-        video = cv2.VideoWriter(str(part), codec, 24, (w, h))
-        for n in progress(range(frames), f"filming {frames} frames"):
-            share = n / (frames - 1)
-            sway = 0.1 * math.sin(2 * math.pi * share)
-            camera[:, 3] = position + sway * camera[:, 0]
-            frame = render_photo(model, scene, photo, torch.lerp(first, last, share))
-            video.write(to_uint8(frame["rgb"][:h, :w, ::-1]))
+        video = cv2.VideoWriter(str(part), cv2.VideoWriter_fourcc(*"mp4v"), 24, (w, h))
+        for n in progress(range(96), "filming 96 frames"):
+            share = n / 95
+            c2w = scene.c2w.clone()
+            c2w[:, :, 3] += 0.1 * math.sin(math.tau * share) * c2w[:, :, 0]
+            view = scene._replace(c2w=c2w)
+            rgb, _, _ = render_photo(model, view, photo, first.lerp(last, share))
+            video.write(to_uint8(rgb[:h, :w, ::-1]))
         video.release()
         return part.stat().st_size > 0
     atomic_write(path, write)
@@ -1590,7 +1478,7 @@ class Parser(argparse.ArgumentParser):
 
 def make_parser():
     parser = Parser(
-        description=__doc__.split("\n\n")[0],
+        description=__doc__.splitlines()[0],
         epilog=f"[Dn]: see geonvs.py's head. Photos on a GPU: {LARGE}",
         argument_default=argparse.SUPPRESS)
     for setting in fields(Config):
@@ -1605,15 +1493,15 @@ def pick_device(name):
     count = torch.cuda.device_count()
     if name == "cpu" or (name == "auto" and count == 0):
         return torch.device("cpu")
-    check(LOCAL_RANK < count, f"--device cuda: {count} GPUs are here for {RANKS} processes")
-    return torch.device("cuda", LOCAL_RANK)
+    check(RANK < count, f"--device cuda: {count} GPUs are here for {RANKS} processes")
+    return torch.device("cuda", RANK)
 
 
 def make_config(given):
     """Config's defaults, then LARGE if photos meet a GPU, then flags."""
     cfg = Config(**given)
     if cfg.source != "toy" and pick_device(cfg.device).type == "cuda":
-        cfg = Config(**(LARGE | given))
+        cfg = Config(**LARGE | given)
     return cfg
 
 
@@ -1643,8 +1531,8 @@ def main(argv=None):
     resume = given.pop("resume", False)
     render = given.pop("render", False)
     cfg = make_config(given)
-    scene_name = data_prep.scene_path(cfg.source).stem
-    run = Path("runs", cfg.name or f"{scene_name}-{GeoNVS.name}-{cfg.seed}")
+    name = f"{data_prep.scene_path(cfg.source).stem}-{GeoNVS.name}-{cfg.seed}"
+    run = Path("runs", cfg.name or name)
     path = run / "checkpoint.pt"
     saved = None
     if resume or render:
@@ -1659,8 +1547,7 @@ def main(argv=None):
         if RANK == 0:
             data_prep.open_scene(cfg.source, cfg.downscale)  # the others find it made
         dist.barrier()
-    raw = data_prep.open_scene(cfg.source, cfg.downscale)  # made on first use
-    scene = load_scene(raw, device)
+    scene = load_scene(data_prep.open_scene(cfg.source, cfg.downscale), device)
     if render:
         with device:
             model = GeoNVS(cfg, scene)
