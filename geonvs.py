@@ -291,9 +291,9 @@ def grid_index(n, like):
 def number_of(index, n=2**13):
     """One number (...) for integers (...,d), each below n: its digits, the largest place first. For
     a cell or corner (level, i, j, k) it is the key."""
-    number = 0
-    for digit in index.unbind(-1):
-        number = number * n + digit
+    number, *digits = index.unbind(-1)
+    for digit in digits:
+        number = torch.add(digit, number, alpha=n)  # digit + n number
     return number
 
 
@@ -491,7 +491,7 @@ class SDFField(nn.Module):
         """sdf (P,) and geometry (P,G) at x (P,3)."""
         feat = self.octree(x)  # (P,LC)
         out = self.network(torch.hstack([x, feat]))  # (P,1+GEO)
-        change, geo = out.tensor_split([1], 1)
+        change, geo = out.split([1, GEO], 1)
         sdf = x.norm(dim=1) - 0.25 + change[:, 0]  # (P,)
         return sdf, torch.hstack([geo, feat])
 
@@ -616,13 +616,13 @@ class Background(nn.Module):
         t = torch.hstack([before, t1 + beyond])  # (R,S)
         x = contract(rays.at(t)).flatten(0, 1)  # (RS,3)
         inputs = torch.hstack([x, self.octree(x)])  # (RS,3+LC)
-        density, geo = mixed_precision(self.density, inputs).tensor_split([1], 1)
+        density, geo = mixed_precision(self.density, inputs).split([1, GEO], 1)
         rgb = colors_of(self.color, geo, per_ray)  # (R,S,3)
         sigma = F.softplus(density.reshape_as(jitter) - 1)  # (R,S)
         alpha = 1 - torch.exp(-sigma[:, :-1] * path.diff())  # (R,S-1)
         w = composite(F.pad(alpha, (0, 1), value=1.0))  # (R,S)
         colors = w[:, :, None] * rgb
-        front, behind = colors.tensor_split([n], 1)
+        front, behind = colors.split([n, S - n], 1)
         passes = 1 - w[:, :n].sum(1, keepdim=True)
         return front.sum(1), passes, behind.sum(1)
 
