@@ -49,8 +49,8 @@ Departures from the printed paper; their tags stand in the code, or in the docst
   [D13] derivatives are taken at the ray's end and, on every second ray, at a random sample, not
         at all samples, which share the normal of the end in the colour network
   [D14] zeta stays above a rising floor, so that no surface stays fog, and below a fixed bound
-  [D15] cells split where colours err, and stay (the paper prunes empty space); a scene that needs
-        no codes, no mask or no background field is modelled without
+  [D15] cells split where colours err, down to a pixel's size, and stay (the paper prunes empty
+        space); a scene that needs no codes, no mask or no background field is modelled without
 """
 import argparse
 import io
@@ -77,7 +77,7 @@ from torch import Tensor, nn
 import data_prep
 from data_prep import UserError, atomic_write, check, progress
 
-torch.set_float32_matmul_precision("highest")  # [D9] no TF32, which some containers switch on
+torch.set_float32_matmul_precision("highest")  # [D9] no TF32 in products of matrices
 
 
 # ---- 1 Config: every field is a flag -------------------------------------------------------------
@@ -169,7 +169,7 @@ class Scene(NamedTuple):
     thumbs: Tensor  # (I,3,n,n) uint8, whole photos for the mask network
     static: Tensor  # (I,n/2,n/2) mask pixels that show SfM points; some wrongly, at outlines [D10]
     raw: dict  # the file in numpy: names, statistics, center, scale, ground truth of the toy
-    info: dict
+    info: dict  # what the file was made from; a checkpoint fits only the same
 
     def photos(self, is_test):
         """Numbers (B,) of the held-out photos, or of those to train on."""
@@ -267,7 +267,7 @@ def corner_weights(f):
 
 class WeightedSum(torch.autograd.Function):
     """Row p of the result: the sum over 8 corners k of w[p,k] table[row[p,k]]. Only the table gets
-    a gradient, as derivatives in x are finite differences [D13]. A step's hottest operation;
+    a gradient, as derivatives in x are finite differences. A step's hottest operation;
     autograd's own backward takes several times as long."""
     @staticmethod
     def forward(ctx, table, row, w):  # (V,C), (P,8), (P,8) -> (P,C)
@@ -284,7 +284,7 @@ class WeightedSum(torch.autograd.Function):
 
 
 def grid_index(n, like):
-    """All index triples (n^3,3) of a cube of n^3 cells, the last index fastest."""
+    """All index triples (n^3,3) of a cube of n^3 cells, the last index fastest, beside `like`."""
     return like.new_ones(n, n, n).nonzero()
 
 
@@ -375,7 +375,7 @@ class Octree(nn.Module):
     def forward(self, x):
         """Features (P,LC) at x (P,3)."""
         node, place = self.locate(x)
-        exists = F.pad(node.diff() > 0, (1, 0), value=True)  # (P,L) else it is the level's above
+        exists = F.pad(node.diff() > 0, (1, 0), value=True)  # (P,L) or a coarser cell's
         node = node.flatten()  # (PL,)
         w = corner_weights(place.flatten(0, 1))  # (PL,8)
         w = w * self.is_free.index_select(0, node) * exists.reshape(-1, 1)
@@ -397,8 +397,9 @@ def in_chunks(function, x):
 
 
 def seed_octree(octree, points, dense):
-    """Splits the first `dense` levels everywhere, two more around points (P,3), neighbours too, so
-    that no corner of a point's cell is hanging; then random features. [D10]"""
+    """Splits the first `dense` levels everywhere, two more, if there are as many, around points
+    (P,3), neighbours too, so that no corner of a point's cell is hanging; then random features.
+    [D10]"""
     for _ in range(dense):
         octree.split(octree.cells)
     neighbours = F.pad(grid_index(3, points) - 1, (1, 0))  # (27,4)
@@ -410,8 +411,8 @@ def seed_octree(octree, points, dense):
 
 
 def worst_cells(octree):
-    """The cells (N,4) that should be split: of those whose children are no finer than a pixel, the
-    worst, which hold most of the recorded error. [D15]"""
+    """The cells (N,4) that should be split: the worst, with 80 % of the error that is recorded in
+    cells whose children are no finer than a pixel. [D15]"""
     level = octree.cells[:, 0]  # (N,)
     error, pixel, count = octree.record.unbind(1)  # (N,) sums over rays
     is_coarse = pixel < count * octree.side[level] / 2  # mean size of a pixel under a child's side
@@ -553,7 +554,7 @@ EVEN = 0.25  # weight of samples spread evenly, so that a lost surface can retur
 
 
 class SDFCache(nn.Module):
-    """The SDF on a dense grid, renewed every 64 steps: where along a ray samples pay. [D11]"""
+    """The SDF on a dense grid, up to 63 steps old: where along a ray samples pay. [D11]"""
     def __init__(self, n):
         super().__init__()
         self.volume = nn.Buffer(torch.zeros(1, 1, n, n, n))  # x slowest
@@ -593,12 +594,12 @@ def contract(x):
 
 class Background(nn.Module):
     """A small NeRF before the sphere and beyond it, on an octree over contracted space."""
-    def __init__(self, points, hidden, per_ray, levels):
+    def __init__(self, points, hidden, extra, levels):
         super().__init__()
         self.octree = Octree(2.0, levels, root=32)
         seed_octree(self.octree, contract(points), dense=levels - 3)  # (K,3)
         self.density = mlp(3 + self.octree.width, hidden, 1 + GEO)
-        self.color = mlp(GEO + per_ray, hidden, 3)
+        self.color = mlp(GEO + extra, hidden, 3)
 
     def forward(self, rays, t0, t1, per_ray, jitter):
         """Returns front (R,3), the colour before t0 (R,1); passes (R,1), the light that front lets
@@ -661,7 +662,7 @@ def render_rays(model, rays, code, jitter):
         end=end,
         normal=normal * opacity[:, None],  # 0 where nothing is
         e_grad=eikonal(grad),
-        e_curv=lap.abs() * model.eps * opacity.detach(),  # [D4]
+        e_curv=lap.abs() * model.eps * opacity.detach(),  # [D3] [D4]
         t=t)
 
 
@@ -731,7 +732,7 @@ def complexity(e_grad, e_curv):
 
 def edge_indicator(richness, centre=0.0, width=1.0):
     """The sigmoid of Eq. 4, of a ray's complexity (R,). Its centre and width are calibrated [D3]:
-    with 0 and 1 it is above 0.5 on every ray."""
+    with 0 and 1 it is at least 0.5 on every ray."""
     return torch.sigmoid((richness - centre) / width)
 
 
@@ -749,7 +750,7 @@ def transient_loss(logit, error, price):
     return F.binary_cross_entropy_with_logits(logit, is_transient, (error - price).abs())
 
 
-TAUGHT = 0.6  # share of training in which the mask learns; longer, it would give people up
+TAUGHT = 0.6  # share of training in which the mask learns [D7]; longer, it would give people up
 
 
 def reject_outliers(mask, is_outlier, done):
@@ -761,8 +762,8 @@ def reject_outliers(mask, is_outlier, done):
 
 
 def follow_quantiles(running, shares, values, is_chosen):
-    """Moves `running` (Q,), above 0, by a factor towards the quantiles `shares` (Q,) of the chosen
-    values (R,): up where too many of them lie above it."""
+    """Moves `running` (Q,), above 0, by a factor towards the quantiles `shares`, (Q,) or (), of the
+    chosen values (R,): up where too many of them lie above it."""
     is_below = (values[:, None] < running) & is_chosen[:, None]  # (R,Q)
     count = is_chosen.sum()
     excess = (count * shares - is_below.sum(0)) / count.clamp_min(1)  # (Q,) 0 if none is chosen
@@ -827,7 +828,7 @@ class GeoNVS(nn.Module):
         has_codes = is_on(cfg.appearance, raw["exposure_spread"] > 0.01)
         A = cfg.appearance_dim if has_codes else 0
         is_inside = scene.points.norm(dim=1) < 1
-        self.sfm = scene.points[is_inside]  # (K,3)
+        self.sfm = scene.points[is_inside]  # (K,3), never empty: data_prep places the sphere so
         octree = Octree(1.0, levels)
         seed_octree(octree, self.sfm, dense=0)
         self.sdf = SDFField(octree, cfg.hidden)
@@ -842,6 +843,7 @@ class GeoNVS(nn.Module):
         nn.init.normal_(self.appearance.weight, std=0.01)
         self.octrees = [octree]
         self.background = None
+        # grey where the scene has no one colour, but --background off was given
         self.bg_color = torch.tensor(raw["bg_color"].tolist()).nan_to_num(0.5)
         if is_on(cfg.background, np.isnan(raw["bg_color"]).any()):  # nan: there is no one colour
             self.background = Background(
@@ -931,10 +933,10 @@ class GeoNVS(nn.Module):
 
     def observe(self, rays, out):
         """Remembers what refining and the mask's prices depend on."""
-        prices = self.mask
+        mask = self.mask
         is_solid = out["opacity"] > 0.5  # (R,)
-        follow_quantiles(prices.richness, prices.shares, out["richness"], is_solid)
-        follow_quantiles(prices.sfm_error, 0.75, out["error"], out["is_static"])
+        follow_quantiles(mask.richness, mask.shares, out["richness"], is_solid)
+        follow_quantiles(mask.sfm_error, 0.75, out["error"], out["is_static"])
         pixel = out["depth"] / self.scene.K[rays.img, 0]  # (R,) its size at the ray's end
         error = (1 - out["mask"]) * out["error"]
         columns = torch.column_stack([error * is_solid, pixel * is_solid, is_solid])  # (R,3)
@@ -1128,7 +1130,7 @@ def restore(saved, path, model, gen):
         model.load_state_dict(saved["model"])
         optimizer = make_optimizer(model)
         optimizer.load_state_dict(saved["optimizer"])
-        if RANK == 0:  # the others go on with rays of their own
+        if RANK == 0:  # the others draw from their first ray again
             gen.set_state(saved["generator"])
         return optimizer, State(**saved["state"])
     except Exception as error:  # as in read_checkpoint
@@ -1145,13 +1147,15 @@ def train(cfg, scene, run, saved=None, kind=GeoNVS):
     with gen.device:
         model = kind(cfg, scene)
     path = run / "checkpoint.pt"
+    stale = RESULTS
     if saved is None:
-        for name in RESULTS:  # nothing of a former run may be taken for this one's
-            (run / name).unlink(missing_ok=True)
         optimizer = make_optimizer(model)
         state = State()
     else:
         optimizer, state = restore(saved, path, model, gen)
+        stale = RESULTS[2:]  # checkpoint and log go on
+    for name in stale:  # nothing of a former run may be taken for this one's
+        (run / name).unlink(missing_ok=True)
     meter = metered_joules(gen.device, state.joules)
     next(meter, None)  # it counts from here
     photos = scene.photos(False)
@@ -1182,13 +1186,13 @@ def train(cfg, scene, run, saved=None, kind=GeoNVS):
 def report(model, path, done, state, terms):
     """A line on the terminal and one in log.jsonl. psnr: of the step's rays, people included."""
     check(all(p.isfinite().all() for p in model.parameters()),
-          "the loss is no longer finite: mend poses, or try a third of the learning rates "
-          f"--lr_grid and --lr_net; checkpoint.pt beside {path} is from before")
+          "weights are no longer finite: mend poses, or try a third of the learning rates "
+          f"--lr_grid and --lr_net; checkpoint.pt beside {path}, if any, is from before")
     numbers = {key: value.item() for key, value in terms.items()}
     numbers["psnr"] = -10 * math.log10(max(numbers["mse"], 1e-10))
     with open(path, "a") as file:
         print(json.dumps(vars(state) | numbers), file=file)
-    print(f"  {done:4.0%}  step {state.step}  psnr {numbers['psnr']:.2f}", flush=True)
+    print(f"  {min(done, 1):4.0%}  step {state.step}  psnr {numbers['psnr']:.2f}", flush=True)
 
 
 # ---- 10 Scoring, mesh, pictures ------------------------------------------------------------------
@@ -1234,7 +1238,7 @@ def fit_codes(model, scene, photos, steps=128, n=64):
         rays = random_rays(scene, img, gen, part=0.5)
         rgb = model.render(rays, codes.repeat_interleave(n, 0))["rgb"]
         loss = (rgb - rays.rgb).abs().mean()
-        [codes.grad] = torch.autograd.grad(loss, codes)
+        [codes.grad] = torch.autograd.grad(loss, codes)  # the model's weights get none
         adam.step()
     return codes.detach()
 
@@ -1572,7 +1576,7 @@ def run_command_line(entry):
             raise
         message = "the memory is full: begin anew with fewer --rays or a larger --downscale"
     except KeyboardInterrupt:
-        message = f"stopped; --resume goes on from the last checkpoint, made every {PAUSE} s"
+        message = f"stopped; --resume goes on from the last checkpoint, one in {PAUSE} s"
     data_prep.warn(f"error: {message}")
     sys.exit(2)
 
