@@ -2383,6 +2383,16 @@ def test_a_run_begins_anew_and_follows_its_seed(scene, tmp_path):
     assert not (tmp_path / "film.mp4").exists()
 
 
+def test_a_resumed_run_goes_on_with_its_log_and_keeps_no_former_results(scene, tmp_path, loop):
+    run_training(scene, tmp_path)
+    (tmp_path / "metrics.json").write_text("of six steps")
+    run_training(scene, tmp_path, read_saved(tmp_path), steps=8)
+    steps = [line["step"] for line in read_log(tmp_path)]
+    assert steps[0] == 1
+    assert steps[-1] == 8
+    assert not (tmp_path / "metrics.json").exists()
+
+
 def start_child(function, folder, **env):
     """A new process that calls a function of this file in a folder."""
     path = [str(Path(part).resolve()) for part in sys.path]
