@@ -2008,6 +2008,14 @@ def test_no_cell_is_smaller_than_a_pixel_and_none_needlessly_large(scene, footpr
     assert model.eps == 2 / 16 / 2 ** min(levels - 1, 2) / 2  # of cells that exist
 
 
+@pytest.mark.parametrize("levels", [3, 4])
+def test_all_but_the_last_two_levels_of_the_background_are_whole(scene, levels):
+    octree = make_model(scene, levels=levels).background.octree
+    count = octree.cells[:, 0].bincount()
+    whole = 32**3 * 8 ** torch.arange(len(count))
+    assert (count == whole).sum() == levels - 2
+
+
 def test_every_parameter_has_one_group_and_the_rate_of_its_kind(warm):
     rates = []
     for group, rate in zip(warm.groups(), warm.rates, strict=True):
