@@ -1007,9 +1007,10 @@ def open_counter(device):
     check(device.type == "cuda", "only GPUs are metered")
     import pynvml
     pynvml.nvmlInit()
-    gpus = [
-        pynvml.nvmlDeviceGetHandleByUUID(f"GPU-{torch.cuda.get_device_properties(number).uuid}")
-        for number in range(RANKS)]  # the first process has the first GPU
+    gpus = []
+    for number in range(RANKS):  # the first process has the first GPU
+        uuid = torch.cuda.get_device_properties(number).uuid
+        gpus.append(pynvml.nvmlDeviceGetHandleByUUID(f"GPU-{uuid}"))
     return lambda: sum(map(pynvml.nvmlDeviceGetTotalEnergyConsumption, gpus)) / 1e3  # mJ
 
 
@@ -1254,10 +1255,10 @@ def render_photo(model, scene, photo, code):
     """A photo's view under an appearance code (A,): its colours, the photo itself and normals, in
     one array (3,H,W,3)."""
     w, h = scene.wh[photo].tolist()
-    columns = [column.split(1024) for column in photo_rays(scene, photo)]
     parts = []
-    for rays in map(Rays, *columns):
-        out = model.render(rays, code.expand(len(rays.o), -1))
+    for pixel in torch.arange(w * h, device=code.device).split(1024):
+        rays = make_rays(scene, torch.full_like(pixel, photo), pixel)
+        out = model.render(rays, code.expand(len(pixel), -1))
         parts.append(torch.stack([out["rgb"], rays.rgb, out["normal"]]))  # (3,R,3)
     return torch.cat(parts, 1).reshape(3, h, w, 3).cpu().numpy()
 
