@@ -1175,6 +1175,8 @@ def train(cfg, scene, run, saved=None, kind=GeoNVS):
             model.refine(optimizer)
         if before < TAUGHT <= done:
             model.decide_mask()
+        if done >= 1:
+            model.before_step(0, 1.0)  # pictures follow the last weights
         is_due = done >= 1 or state.seconds >= next_log
         if RANK == 0 and is_due:
             next_log = state.seconds + PAUSE

@@ -2391,6 +2391,13 @@ def test_a_run_begins_anew_and_follows_its_seed(scene, tmp_path):
     assert not (tmp_path / "film.mp4").exists()
 
 
+def test_a_finished_run_samples_by_its_last_weights(scene, tmp_path):
+    model, _ = run_training(scene, tmp_path, steps=3)
+    wanted = geonvs.in_chunks(model.distance, model.cache.points)
+    assert torch.equal(model.cache.volume.flatten(), wanted)
+    assert torch.equal(read_saved(tmp_path)["model"]["cache.volume"], model.cache.volume)
+
+
 def test_a_resumed_run_goes_on_with_its_log_and_keeps_no_former_results(scene, tmp_path, loop):
     run_training(scene, tmp_path)
     (tmp_path / "metrics.json").write_text("of six steps")
