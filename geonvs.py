@@ -53,15 +53,17 @@ Departures from the printed paper; their tags stand in the code, or in the docst
         space); a scene that needs no codes, no mask or no background field is modelled without
 """
 import argparse
+import inspect
 import io
 import json
 import math
 import os
+import re
 import resource
 import subprocess
 import sys
 import time
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -82,12 +84,6 @@ torch.set_float32_matmul_precision("highest")  # [D9] no TF32 in products of mat
 
 # ---- 1 Config: every field is a flag -------------------------------------------------------------
 
-def opt(default, text, *choices):
-    return field(
-        default=default,
-        metadata=dict(help=f"{text} [{default}]", choices=choices or None))
-
-
 AT_LEAST = dict(  # 0 for other settings
     steps=1,
     downscale=1,
@@ -96,38 +92,46 @@ AT_LEAST = dict(  # 0 for other settings
     samples=3,  # with fewer, zeta's upper bound would lie below its floor
     bg_samples=6,
     hidden=1)
+SWITCH = ("auto", "on", "off")
+CHOICES = dict(
+    scene=("toy", *data_prep.SCENES),
+    device=("auto", "cpu", "cuda"),
+    levels=range(9),
+    appearance=SWITCH,
+    mask=SWITCH,
+    background=SWITCH)
 
 
 @dataclass
 class Config:
-    """All settings. Of these defaults lam_gpl alone is the paper's."""
-    scene: str = opt("toy", "toy: synthetic; others: Phototourism", "toy", *data_prep.SCENES)
-    data: str = opt("", "an IMC-PT or COLMAP folder instead of a named scene")
-    name: str = opt("", "run folder below runs/ (default: scene-method-seed)")
-    seed: int = opt(0, "seed of everything random")
-    device: str = opt("auto", "auto: a GPU if there is one", "auto", "cpu", "cuda")
-    steps: int = opt(3000, "training steps")
-    minutes: float = opt(0.0, "training budget in minutes, instead of --steps if above 0")
-    downscale: int = opt(2, "integer factor by which photos are made smaller (benchmarks use 2)")
-    rays: int = opt(512, "rays per step, of all processes together")
-    photos: int = opt(8, "photos per step, of each process; the mask network sees them whole")
-    samples: int = opt(15, "sections S of a ray in the foreground, S + 1 samples")
-    bg_samples: int = opt(24, "background samples per ray, a sixth of them before the sphere")
-    levels: int = opt(0, "octree levels, 0: from the pixel footprint at the surface", *range(9))
-    hidden: int = opt(64, "width of the MLPs")
-    appearance_dim: int = opt(16, "length of a photo's appearance code")
-    appearance: str = opt("auto", "codes; auto: on if exposures differ", "auto", "on", "off")
-    mask: str = opt("auto", "auto: off if it marks hardly anything", "auto", "on", "off")
-    background: str = opt("auto", "field; auto: off if it is one colour", "auto", "on", "off")
-    lam_eik: float = opt(0.04, "weight of the eikonal loss (Permuto-SDF)")
-    lam_curv: float = opt(0.01, "weight of the curvature loss, on |lap| eps [D4]")
-    lam_gpl: float = opt(0.05, "weight of the geometry-preservation loss (paper) [D7]")
-    lam_lps: float = opt(1e-5, "weight of the Lipschitz loss, log form [D5]")
-    lam_sfm: float = opt(7.5e-3, "weight of min(zeta, 40) |s(p)| at SfM points [D10]")
-    lam_mask: float = opt(0.04, "error above that of SfM pixels that masks a ray [D7]")
-    lr_grid: float = opt(1e-2, "learning rate of octree features")
-    lr_code: float = opt(3e-2, "learning rate of appearance codes")
-    lr_net: float = opt(4e-3, "learning rate of networks")
+    """All settings; --help shows these comments. Of the defaults lam_gpl alone is the paper's."""
+    scene: str = "toy"  # toy: synthetic; others: Phototourism
+    data: str = ""  # an IMC-PT or COLMAP folder instead of a named scene
+    name: str = ""  # run folder below runs/ (default: scene-method-seed)
+    seed: int = 0  # seed of everything random
+    device: str = "auto"  # auto: a GPU if there is one
+    steps: int = 3000  # training steps
+    minutes: float = 0.0  # training budget in minutes, instead of --steps if above 0
+    downscale: int = 2  # integer factor by which photos are made smaller (benchmarks use 2)
+    rays: int = 512  # rays per step, of all processes together
+    photos: int = 8  # photos per step, of each process; the mask network sees them whole
+    samples: int = 15  # sections S of a ray in the foreground, S + 1 samples
+    bg_samples: int = 24  # background samples per ray, a sixth of them before the sphere
+    levels: int = 0  # octree levels, 0: from the pixel footprint at the surface
+    hidden: int = 64  # width of the MLPs
+    appearance_dim: int = 16  # length of a photo's appearance code
+    appearance: str = "auto"  # codes; auto: on if exposures differ
+    mask: str = "auto"  # auto: off if it marks hardly anything
+    background: str = "auto"  # field; auto: off if it is one colour
+    lam_eik: float = 0.04  # weight of the eikonal loss (Permuto-SDF)
+    lam_curv: float = 0.01  # weight of the curvature loss, on |lap| eps [D4]
+    lam_gpl: float = 0.05  # weight of the geometry-preservation loss (paper) [D7]
+    lam_lps: float = 1e-5  # weight of the Lipschitz loss, log form [D5]
+    lam_sfm: float = 7.5e-3  # weight of min(zeta, 40) |s(p)| at SfM points [D10]
+    lam_mask: float = 0.04  # error above that of SfM pixels that masks a ray [D7]
+    lr_grid: float = 1e-2  # learning rate of octree features
+    lr_code: float = 3e-2  # learning rate of appearance codes
+    lr_net: float = 4e-3  # learning rate of networks
 
     def __post_init__(self):
         """Refuses numbers that cannot work, before anything is written."""
@@ -985,14 +989,6 @@ class GeoNVS(nn.Module):
         """Appearance codes (I,A) of all photos."""
         return self.appearance.weight.detach()
 
-    def surface_color(self, x):
-        """Colours (P,3) of surface points (P,3), seen along their normals under the mean code."""
-        grad, _ = self.sdf.derivatives(x, self.eps)
-        normal = F.normalize(grad)
-        code = mean_code(self).expand(len(x), -1)
-        _, geo = self.sdf(x)
-        return self.color(torch.hstack([geo, normal, -normal, code])).sigmoid()
-
     def render(self, rays, code):
         """render_rays without jitter, for pictures and for fitting codes."""
         draws = self.cfg.samples - 1 + self.cfg.bg_samples
@@ -1122,16 +1118,17 @@ def read_checkpoint(path, given):
                         f"({type(error).__name__}): train again under another --name") from None
 
 
-def restore(saved, path, model, gen):
-    """Puts a checkpoint's weights into a model; returns its optimiser and State."""
+def restore(saved, path, model, gen=None):
+    """Puts a checkpoint's weights into a model, and its random numbers into gen, which must be of
+    the same kind of device; returns its optimiser and State."""
     try:
         check(saved["scene"] == model.scene.info, "another scene or split")
         for octree, keys in zip(model.octrees, saved["octrees"], strict=True):
-            octree.build(keys.to(gen.device))
+            octree.build(keys.to(octree.child.device))
         model.load_state_dict(saved["model"])
         optimizer = make_optimizer(model)
         optimizer.load_state_dict(saved["optimizer"])
-        if RANK == 0:  # the others draw from their first ray again
+        if gen and RANK == 0:  # the others draw from their first ray again
             gen.set_state(saved["generator"])
         return optimizer, State(**saved["state"])
     except Exception as error:  # as in read_checkpoint
@@ -1345,9 +1342,8 @@ def toy_truth(model, scene):
 
 def extract_mesh(model):
     """The surface s = 0, cut open at the unit sphere, by marching cubes with two cells per finest
-    octree cell, at most 512: vertices (P,3) in SfM units, faces (F,3), colours (P,3) uint8 as seen
-    along the normals under the mean code. s is evaluated near the surface; elsewhere the cache
-    gives its sign."""
+    octree cell, at most 512: vertices (P,3) in SfM units, faces (F,3). s is evaluated near the
+    surface; elsewhere the cache gives its sign."""
     n = min(round(2 / model.eps), 512)
     cache = model.cache.volume
     volume = F.interpolate(cache, n + 1, mode="trilinear", align_corners=True)[0, 0]
@@ -1357,15 +1353,14 @@ def extract_mesh(model):
     square = np.linspace(-1, 1, n + 1) ** 2
     is_inside = square[:, None, None] + square[:, None] + square < 1  # (n+1,n+1,n+1)
     if len(np.unique(volume[is_inside] < 0)) < 2:
-        return [np.zeros((0, 3))] * 3
+        return [np.zeros((0, 3))] * 2
     vertices, faces, _, _ = marching_cubes(volume, 0, mask=is_inside)
     vertices = vertices * (2 / n) - 1
-    colors = in_chunks(model.surface_color, torch.tensor(vertices).to(cache))
     raw = model.scene.raw
-    return vertices * raw["scale"] + raw["center"], faces, to_uint8(colors.cpu())
+    return vertices * raw["scale"] + raw["center"], faces
 
 
-def write_ply(path, vertices, faces, colors):
+def write_ply(path, vertices, faces):
     """A PLY file of text; with fewer than nine digits coordinates of a map lose their metres."""
     header = f"""ply
 format ascii 1.0
@@ -1373,9 +1368,6 @@ element vertex {len(vertices)}
 property double x
 property double y
 property double z
-property uchar red
-property uchar green
-property uchar blue
 element face {len(faces)}
 property list uchar int vertex_indices
 end_header
@@ -1384,7 +1376,7 @@ end_header
     def write(part):
         with open(part, "w") as file:
             file.write(header)
-            np.savetxt(file, np.hstack([vertices, colors]), "%.9g %.9g %.9g %d %d %d")
+            np.savetxt(file, vertices, "%.9g")
             np.savetxt(file, faces, "3 %d %d %d")
     atomic_write(path, write)
 
@@ -1488,8 +1480,13 @@ def make_parser():
         description=__doc__.splitlines()[0],
         epilog=f"[Dn]: see geonvs.py's head. Photos on a GPU: {LARGE}",
         argument_default=argparse.SUPPRESS)
+    comments = dict(re.findall(r"(\w+): .+  # (.+)", inspect.getsource(Config)))
     for setting in fields(Config):
-        parser.add_argument(f"--{setting.name}", type=setting.type, **setting.metadata)
+        parser.add_argument(
+            f"--{setting.name}",
+            type=setting.type,
+            choices=CHOICES.get(setting.name),
+            help=f"{comments[setting.name]} [{setting.default}]")
     parser.add_argument("--resume", action="store_true", help="go on from the run's checkpoint")
     parser.add_argument("--render", action="store_true", help="film a finished run")
     return parser
@@ -1558,7 +1555,7 @@ def main(argv=None):
     if render:
         with device:
             model = GeoNVS(cfg, scene)
-        restore(saved, path, model, torch.Generator(device))
+        restore(saved, path, model)
         if RANK == 0:
             film(model, scene, run / "film.mp4")
     else:
