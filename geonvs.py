@@ -19,8 +19,9 @@ Conventions
   symbols   s signed distance, zeta sharpness of walls (1 / zeta is their width), eps length of the
             taps of finite differences, lap the Laplacian, E_grad = (|grad s| - 1)^2, Phi edges
   shapes    R rays, S sections of a ray (S + 1 samples), P points, N cells or what a line says, L
-            octree levels, C channels per level, V rows of features, H hidden width, G what colour
-            is read from, A appearance dims, B photos of all I, K SfM points, T sightings of them
+            octree levels, C channels per level, V rows of features, G what colour is read
+            from, H, W height and width, A appearance dims, B photos of all I, K SfM points, T
+            sightings of them
 
 Departures from the printed paper; their tags stand in the code, or in the docstring above it:
   [D1]  alpha is divided by sigmoid(zeta s_i) and never negative (printed: a wall is 63 % opaque)
@@ -108,7 +109,7 @@ class Config:
     scene: str = "toy"  # toy: synthetic; others: Phototourism
     data: str = ""  # an IMC-PT or COLMAP folder instead of a named scene
     name: str = ""  # run folder below runs/ (default: scene-method-seed)
-    seed: int = 0  # seed of everything random
+    seed: int = 0  # seed of training; a toy has its own
     device: str = "auto"  # auto: a GPU if there is one
     steps: int = 3000  # training steps
     minutes: float = 0.0  # training budget in minutes, instead of --steps if above 0
@@ -271,8 +272,8 @@ def corner_weights(f):
 
 class WeightedSum(torch.autograd.Function):
     """Row p of the result: the sum over 8 corners k of w[p,k] table[row[p,k]]. Only the table gets
-    a gradient, as derivatives in x are finite differences. A step's hottest operation;
-    autograd's own backward takes several times as long."""
+    a gradient, as derivatives in x are finite differences. The own backward of embedding_bag takes
+    several times as long."""
     @staticmethod
     def forward(ctx, table, row, w):  # (V,C), (P,8), (P,8) -> (P,C)
         ctx.save_for_backward(table, row, w)
@@ -601,7 +602,7 @@ class Background(nn.Module):
     def __init__(self, points, hidden, extra, levels):
         super().__init__()
         self.octree = Octree(2.0, levels, root=32)
-        seed_octree(self.octree, contract(points), dense=levels - 3)  # (K,3)
+        seed_octree(self.octree, contract(points), dense=levels - 3)  # (N,3)
         self.density = mlp(3 + self.octree.width, hidden, 1 + GEO)
         self.color = mlp(GEO + extra, hidden, 3)
 
@@ -766,8 +767,8 @@ def reject_outliers(mask, is_outlier, done):
 
 
 def follow_quantiles(running, shares, values, is_chosen):
-    """Moves `running` (Q,), above 0, by a factor towards the quantiles `shares`, (Q,) or (), of the
-    chosen values (R,): up where too many of them lie above it."""
+    """Moves Q `running` numbers (Q,), above 0, by a factor towards the quantiles `shares`, (Q,) or
+    (), of the chosen values (R,): up where too many of them lie above it."""
     is_below = (values[:, None] < running) & is_chosen[:, None]  # (R,Q)
     count = is_chosen.sum()
     excess = (count * shares - is_below.sum(0)) / count.clamp_min(1)  # (Q,) 0 if none is chosen
@@ -785,7 +786,7 @@ class TransientMask(CGNet):
         self.sfm_error = nn.Buffer(torch.tensor([0.3]))  # (1,) upper quartile at SfM pixels
 
     def logits(self, photos):
-        """Logits (B,1,m,m) of photos (B,)."""
+        """Logits (B,1,n/2,n/2) of photos (B,)."""
         return self(self.thumbs[photos] / 255)
 
     def is_static(self, rays):
@@ -832,7 +833,7 @@ class GeoNVS(nn.Module):
         has_codes = is_on(cfg.appearance, raw["exposure_spread"] > 0.01)
         A = cfg.appearance_dim if has_codes else 0
         is_inside = scene.points.norm(dim=1) < 1
-        self.sfm = scene.points[is_inside]  # (K,3), never empty: data_prep places the sphere so
+        self.sfm = scene.points[is_inside]  # (N,3), never empty: data_prep places the sphere so
         octree = Octree(1.0, levels)
         seed_octree(octree, self.sfm, dense=0)
         self.sdf = SDFField(octree, cfg.hidden)
@@ -1108,7 +1109,7 @@ def read_checkpoint(path, given):
     """A checkpoint's dictionary, tensors and plain values, never code; and its settings, replaced
     by those given. Raises UserError."""
     check(path.exists(), f"{path} does not exist: train first, without --resume or --render, or "
-          "name the run by the --data, --seed and --name that it was made with")
+          "name the run by the --scene, --data, --seed or --name it was made with")
     try:
         data_prep.refuse_bomb(path)
         saved = dict(torch.load(path, map_location="cpu", weights_only=True))
@@ -1313,8 +1314,7 @@ def evaluate(model, scene, lpips=None):
 def toy_truth(model, scene):
     """What only a toy can tell. sdf_error: mean |s - s_true| near visible walls, scene units;
     normal_error: median angle at walls, degrees, by taps of 0.004. mask_iou, mask_static: M > 0.5
-    against the true occluders of training photos, and mean M on all other pixels; None without a
-    mask."""
+    against the true occluders of training photos, and mean M on all other pixels; None without."""
     raw = scene.raw
     near, sdf, wall, normal = [
         torch.as_tensor(raw[name]).to(scene.c2w)
@@ -1342,7 +1342,7 @@ def toy_truth(model, scene):
 
 def extract_mesh(model):
     """The surface s = 0, cut open at the unit sphere, by marching cubes with two cells per finest
-    octree cell, at most 512: vertices (P,3) in SfM units, faces (F,3). s is evaluated near the
+    octree cell, at most 512: vertices (P,3) in SfM units, faces (N,3). s is evaluated near the
     surface; elsewhere the cache gives its sign."""
     n = min(round(2 / model.eps), 512)
     cache = model.cache.volume
@@ -1361,7 +1361,7 @@ def extract_mesh(model):
 
 
 def write_ply(path, vertices, faces):
-    """A PLY file of text; with fewer than nine digits coordinates of a map lose their metres."""
+    """A PLY file of text; with fewer than nine digits coordinates of a map lose their centimetres."""
     header = f"""ply
 format ascii 1.0
 element vertex {len(vertices)}
@@ -1391,7 +1391,7 @@ def write_panel(path, model, scene, codes):
         kind = "held out" if scene.is_test[photo] else "training"
         text = f"{kind}: {scene.raw['name'][photo]}, render, normals"
         if model.cfg.mask != "off":
-            M = model.mask.logits([photo])[0, 0].detach().sigmoid().cpu()  # (m,m)
+            M = model.mask.logits([photo])[0, 0].detach().sigmoid().cpu()  # (n/2,n/2)
             tiles.append(np.dstack([M] * 3))
             text += ", mask (white: transient)"
         h, w, _ = rgb.shape
