@@ -23,6 +23,7 @@ import subprocess
 import sys
 import tarfile
 import tracemalloc
+from collections import defaultdict
 from dataclasses import asdict, fields, replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -128,16 +129,9 @@ def make_batch(model, n=64):
 
 
 def fake_rays(o, d):
-    """Rays of photo 0 from o (R,3) along d (R,3)."""
-    zero = 0 * o
-    img = zero[:, 0].long()
-    return geonvs.Rays(
-        o,
-        F.normalize(d),
-        zero[:, :1] + 0.1,
-        img,
-        zero[:, :2],
-        zero)
+    """Rays of no photo from o (R,3) along d (R,3)."""
+    near = torch.full((len(o), 1), 0.1)
+    return geonvs.Rays(o, F.normalize(d), near, None, None, None)
 
 
 def gradients(model, value):
@@ -1492,8 +1486,7 @@ def test_a_lookup_and_its_gradient_equal_plain_loops(double):
     x = random(60, 3, low=-1.6, high=1.6)
     wanted = torch.stack(list(map(plain_octree(octree), x)))
     assert_one_function(octree, octree(x), wanted)
-    assert (wanted[:, 6] != 0).any()
-    assert (wanted[:, 6] == 0).any()
+    assert wanted[:, 6].any()  # some lie in cells of the last level
 
 
 def test_a_lookup_of_no_number_is_finite(double):
@@ -1508,14 +1501,12 @@ def test_seeding_leaves_no_hanging_corner_around_points():
     node, _ = octree.locate(points)
     assert (octree.cells[node, 0] == torch.arange(4)).all()
     assert octree.is_free[node].all()
-    assert (octree.cells[:, 0] == 1).sum() == 16**3
     assert 0.005 < octree.features.std() < 0.02
 
 
 def test_the_worst_cells_that_hold_most_of_the_error_are_chosen(monkeypatch):
     octree = make_tree()
-    n = len(octree.cells)
-    octree.record = random(n, 3)
+    octree.record.uniform_()
     octree.record[:, 1] /= 4  # pixels of about the sizes of cells
     candidates = []
     for row, level in enumerate(octree.cells[:, 0].tolist()):
@@ -1532,7 +1523,7 @@ def test_the_worst_cells_that_hold_most_of_the_error_are_chosen(monkeypatch):
         left -= error
     worst = octree.cells[wanted]
     assert torch.equal(geonvs.worst_cells(octree), worst)
-    monkeypatch.setattr(geonvs, "MAX_CELLS", n + 47)  # room for five splits
+    monkeypatch.setattr(geonvs, "MAX_CELLS", len(octree.cells) + 47)  # five splits
     assert torch.equal(geonvs.worst_cells(octree), worst[:5])
 
 
@@ -1608,8 +1599,8 @@ def plain_sdf(model, x):
 def plain_color(model, x):
     """Colour (3,) that the Lipschitz network reads from x."""
     for layer in model.color[::2]:
-        rows = [row * min(1, layer.c.exp() / row.abs().sum()) for row in layer.weight]
-        out = torch.stack(rows) @ x + layer.bias
+        scale = layer.c.exp() / layer.weight.abs().sum(1)  # of each row
+        out = scale.clamp(max=1) * (layer.weight @ x) + layer.bias
         x = out.relu()
     return out.sigmoid()
 
@@ -1646,7 +1637,8 @@ def plain_background(model, o, d, near, t0, t1, per_ray, jitter):
         path.append(t)
         sigmas.append(F.softplus(out[0] - 1))
         colors.append(color.sigmoid())
-    alphas = 1 - torch.exp(-torch.stack(sigmas[:-1]) * torch.stack(path).diff())
+    depths = torch.stack(sigmas[:-1]) * torch.stack(path).diff()  # optical
+    alphas = 1 - torch.exp(-depths)
     w = plain_weights([*alphas, 1])
     colors = torch.stack(colors)
     return w[:n] @ colors[:n], 1 - w[:n].sum(), w[n:] @ colors[n:]
@@ -1657,7 +1649,8 @@ def plain_render(model, o, d, near, t, code, jitter):
     zeta = torch.exp(10 * model.v)
     samples = [plain_sdf(model, o + distance * d) for distance in t]
     phi = [(zeta * s).sigmoid() for s, _ in samples]
-    w = plain_weights([(1 - b / a).relu() for a, b in itertools.pairwise(phi)])
+    alphas = [(1 - after / before).relu() for before, after in itertools.pairwise(phi)]
+    w = plain_weights(alphas)
     opacity = w.sum()
     depth = (1 - opacity) * t[-1] + w @ (t[:-1] + t[1:]) / 2
     depth = depth.detach()
@@ -1726,36 +1719,30 @@ def test_a_mask_is_half_as_large_as_its_photo_and_starts_low():
 
 
 def test_pixels_that_show_sfm_points_are_static(warm, scene):
-    n = warm.mask.static.shape[1]
-    wanted = torch.zeros(len(scene.wh), n, n, dtype=torch.bool)
+    wanted = torch.zeros(len(scene.wh), 32, 32, dtype=torch.bool)
     for photo, (u, v) in zip(scene.raw["track_photo"], scene.raw["track_uv"]):
         if 0 <= u < 1 and 0 <= v < 1:
-            wanted[photo, int(v * n), int(u * n)] = True
+            wanted[photo, int(v * 32), int(u * 32)] = True
     assert torch.equal(warm.mask.static, wanted)
-    assert n == 32
 
 
 @pytest.mark.parametrize("done, least", [(0.0, 0.0), (0.15, 0.25), (0.3, 1.0)])
-def test_outliers_are_rejected_that_the_network_suspects_and_nothing_else(done, least):
+def test_outliers_are_rejected_that_the_network_suspects(done, least):
     mask = (torch.arange(100) + 0.5) / 100
     wanted = torch.where(mask > least, 1.0, mask)
     close(geonvs.reject_outliers(mask, mask > 0, done), wanted)
-    close(geonvs.reject_outliers(mask, mask < 0, done), mask)
 
 
-def test_quantiles_are_followed_over_meant_values_only():
-    running = torch.ones(2)
-    shares = torch.tensor([0.5, 0.95])
-    values = torch.cat([random(100), torch.full((900,), 1e6)])
-    for limit in 200 * [1e6] + [-1]:  # none is meant at last
-        geonvs.follow_quantiles(running, shares, values, values < limit)
-    close((values[:100, None] < running).float().mean(0), shares, 0.03)
+def test_phi_has_a_width_if_all_quantiles_are_alike(warm):
+    warm.mask.richness.fill_(2.0)
+    phi = warm.mask.phi(torch.tensor(2.001), 1)
+    close(phi, 1 / (1 + math.exp(-1)), 1e-3)
 
 
-def fake_out():
-    """What a step hands to observe: 40 of 1,000 rays end on the foreground."""
+def test_observing_follows_quantiles_and_records_where_foreground_rays_end(warm):
+    rays, _ = make_batch(warm, 1000)
     index = torch.arange(1000)
-    return dict(
+    out = dict(  # 40 of 1,000 rays end on the foreground
         opacity=torch.where(index < 40, 0.9, 0.1),
         richness=torch.where(index < 40, random(1000), 50.0),
         error=random(1000),
@@ -1763,107 +1750,72 @@ def fake_out():
         depth=2 + random(1000),
         mask=random(1000),
         end=random(1000, 3, low=-0.9, high=0.9))
-
-
-def test_phi_is_calibrated_on_the_foreground_however_few_rays_end_there(warm):
-    rays, _ = make_batch(warm, 1000)
-    out = fake_out()
-    for _ in range(300):
-        warm.observe(rays, out)
-    phi = warm.mask.phi(out["richness"], out["opacity"])[:40] / 0.9
-    close((phi > 0.5).float().mean(), 0.25, 0.02)
-    assert phi.std() > 0.2
-
-
-def test_phi_has_a_width_if_all_quantiles_are_alike(warm):
-    warm.mask.richness.fill_(2.0)
-    phi = warm.mask.phi(torch.tensor([2, 2.001]), 0.8)
-    close(phi, [0.4, 0.8 / (1 + math.exp(-1))], 1e-3)
-
-
-def test_observing_follows_errors_of_sfm_pixels_and_records_where_rays_end(warm):
-    rays, _ = make_batch(warm, 1000)
-    out = fake_out()
     octree = warm.sdf.octree
     pixel = out["depth"] / warm.scene.K[rays.img, 0]
     error = (1 - out["mask"]) * out["error"]
-    columns = torch.stack([error, pixel, torch.ones(1000)], 1)
+    columns = torch.column_stack([error, pixel, torch.ones(1000)])
     finest = octree.locate(out["end"])[0][:, -1]
     wanted = torch.zeros(len(octree.cells), 3)
-    for r in range(40):  # the others end beyond the foreground
+    for r in range(40):
         wanted[finest[r]] += columns[r]
     warm.observe(rays, out)
     close(octree.record, wanted)
-    for _ in range(200):
+    for _ in range(400):
         warm.observe(rays, out)
-    close(
-        (out["error"][::2] < warm.mask.sfm_error).float().mean(),
-        0.75,
-        0.03)
+    warm.observe(rays, out | dict(opacity=torch.zeros(1000)))  # moves no quantile of richness
+    is_below = out["richness"][:40, None] < warm.mask.richness
+    close(is_below.float().mean(0), [0.5, 0.75, 0.95], 0.02)
+    is_below = out["error"][::2] < warm.mask.sfm_error
+    close(is_below.float().mean(), 0.75, 0.02)
 
 
 # ---- 7 model and objective -----------------------------------------------------------------------
 
-def plain_losses(model, rays, photos, done, gen):
-    """The objective by a loop over rays; its terms and the mask's lesson."""
+def plain_losses(model, rays, done):
+    """Terms of the objective by a loop over eight rays; the lesson is the mask's."""
     cfg = model.cfg
-    R = len(rays.o)
-    half = R // 2
-    jitter = geonvs.uniform(gen, R, cfg.samples - 1 + cfg.bg_samples)
-    which = (geonvs.uniform(gen, R) * (cfg.samples + 1)).long()
-    sfm = (geonvs.uniform(gen, half) * len(model.sfm)).long()
+    gen = generator()
+    jitter = geonvs.uniform(gen, 8, 10)
+    which = (geonvs.uniform(gen, 8) * 6).long()
+    sfm = (geonvs.uniform(gen, 4) * len(model.sfm)).long()
     out = geonvs.render_rays(model, rays, model.appearance(rays.img), jitter)
     p50, p75, p95 = model.mask.richness.tolist()
     price = max(0.15, cfg.lam_mask + model.mask.sfm_error.item())
-    n = model.mask.static.shape[1]
-    terms = dict.fromkeys(
-        ("rgb", "eik", "curv", "lps", "sfm", "mask", "gpl"),
-        0.0)
-    lesson = 0.0
-    for r in range(R):
+    pull = min(40, model.zeta().item())
+    terms = defaultdict(float)
+    for r in range(8):
         residual = (out["rgb"][r] - rays.rgb[r]).abs()
         e_grad = out["e_grad"][r]
         e_curv = out["e_curv"][r]
-        detail = (10 * e_grad + 2 * e_curv).item()
-        phi = out["opacity"][r].item() / (1 + math.exp(4 * (p75 - detail) / (p95 - p50)))
+        edge = 4 * (10 * e_grad + 2 * e_curv - p75) / (p95 - p50)
+        phi = (out["opacity"][r] * edge.sigmoid()).item()
         M = 0.0
-        if cfg.mask != "off":
+        if cfg.mask == "on":
             photo = rays.img[r].item()
-            logit = geonvs.sample_logits(
-                model.mask.logits([photo]),
-                rays.uv[r])
+            logit, = geonvs.sample_logits(model.mask.logits([photo]), rays.uv[r])
             M = logit.sigmoid().item()
-            col, row = (rays.uv[r] * n).long()
+            col, row = (rays.uv[r] * 32).long()
             excess = -price - cfg.lam_gpl * phi
             if not model.mask.static[photo, row, col]:
                 excess += residual.max().item()
-            right = logit if excess > 0 else -logit
             if done < 0.6:
-                lesson = lesson - abs(excess) * F.logsigmoid(right)[0] / R
+                right = logit if excess > 0 else -logit
+                terms["lesson"] -= abs(excess) * F.logsigmoid(right) / 8
             if excess > 0 and M > (done / 0.3) ** 2:
                 M = 1.0
-        terms["rgb"] += (1 - M) * residual.mean() / R
-        terms["eik"] += e_grad / 2 / R
+        terms["mse"] += residual.square().mean() / 8
+        terms["rgb"] += (1 - M) * residual.mean() / 8
+        terms["eik"] += e_grad / 2 / 8
         if r % 2 == 0:
-            x = rays.o[r] + out["t"][r, which[r]] * rays.d[r]
-            grad, _ = model.sdf.derivatives(x[None], model.eps)
-            terms["eik"] += (grad.norm() - 1) ** 2 / 2 / half
-        terms["curv"] += e_curv / R
-        terms["mask"] += M / R
-        terms["gpl"] += M * phi / R
-    for x in model.sfm[sfm]:
-        on = model.distance(x[None])[0].abs()
-        terms["sfm"] += min(model.zeta().item(), 40) * on / half
-    for layer in model.color[::2]:
-        terms["lps"] += layer.c
-    return terms, lesson
-
-
-LAMBDAS = dict(
-    lam_eik=0.3,
-    lam_curv=0.7,
-    lam_lps=0.11,
-    lam_sfm=0.5)
+            x = rays.at(out["t"])[[r], which[r]]
+            grad, _ = model.sdf.derivatives(x, model.eps)
+            terms["eik"] += (grad.norm() - 1) ** 2 / 2 / 4
+        terms["curv"] += e_curv / 8
+        terms["mask"] += M / 8
+        terms["gpl"] += M * phi / 8
+    terms["lps"] = sum(layer.c for layer in model.color[::2])
+    terms["sfm"] = pull * model.distance(model.sfm[sfm]).abs().mean()
+    return terms
 
 
 @pytest.mark.parametrize("mask, zeta, sfm_error, done", [
@@ -1871,34 +1823,30 @@ LAMBDAS = dict(
     ("on", 50.0, 0.02, 0.7),
     ("off", 30.0, 0.2, 0.02)])
 def test_the_objective_and_its_gradients_equal_plain_loops(
-        double, warm_start, mask, zeta, sfm_error, done):
-    model = rough_model(warm_start, mask=mask, lam_gpl=0.4, **LAMBDAS)
-    rays, photos = rough_rays(model)
+        double, mask, zeta, sfm_error, done):
+    model, rays, photos = rough_case(mask=mask, lam_gpl=0.4)
     model.v.data.fill_(math.log(zeta) / 10)
     model.mask.richness.copy_(torch.tensor([1.0, 6, 20]))
     model.mask.sfm_error.fill_(sfm_error)
     model.mask.static.bernoulli_(0.5)
     total, terms, _ = model.losses(rays, photos, done, generator())
-    plain, wanted = plain_losses(model, rays, photos, done, generator())
-    for name, value in plain.items():
-        close(terms[name], value)
-        wanted = wanted + LAMBDAS.get(f"lam_{name}", name == "rgb") * value
-    close(total, wanted)
-    wanted = gradients(model, wanted)
-    for name, grad in gradients(model, total).items():
-        close(grad, wanted[name], 1e-7)
-        is_taught = mask == "on" and done < 0.6
-        assert grad.any() == (is_taught or not name.startswith("mask")), name
+    plain = plain_losses(model, rays, done)
+    for name, value in terms.items():
+        close(value, plain[name])
+    wanted = plain["rgb"] + plain["lesson"]
+    for name in ("eik", "curv", "lps", "sfm"):
+        wanted = wanted + getattr(model.cfg, f"lam_{name}") * plain[name]
+    is_taught = mask == "on" and done < 0.6
+    assert_one_function(model, total, wanted, is_taught)
 
 
 @pytest.mark.parametrize("zeta", [1.0, 1e4])
 @pytest.mark.parametrize("distance", [-1e3, -1e-6, 0.0, 1e-6, 1e3])
 def test_a_step_is_finite_whatever_the_sdf_and_its_sharpness(warm, distance, zeta):
-    rays, photos = make_batch(warm)
     warm.sdf.network[2].weight.data *= 1e-3
     warm.sdf.network[2].bias.data.fill_(distance)
     warm.v.data.fill_(math.log(zeta) / 10)
-    total, _, _ = warm.losses(rays, photos, 0, generator())
+    total, _, _ = warm.losses(*make_batch(warm), 0, generator())
     assert total.isfinite()
     for grad in gradients(warm, total).values():
         assert grad.isfinite().all()
@@ -1907,9 +1855,8 @@ def test_a_step_is_finite_whatever_the_sdf_and_its_sharpness(warm, distance, zet
 @pytest.mark.parametrize("setting", ["auto", "on", "off"])
 @pytest.mark.parametrize("spread, blue", [(0.009, 0.6), (0.011, math.nan)])
 def test_codes_and_background_follow_the_scene_unless_they_are_set(scene, setting, spread, blue):
-    statistics = dict(exposure_spread=spread, bg_color=np.array([0.2, 0.4, blue]))
-    other = scene._replace(raw=scene.raw | statistics)
-    model = make_model(other, appearance=setting, background=setting)
+    raw = scene.raw | dict(exposure_spread=spread, bg_color=np.array([0.2, 0.4, blue]))
+    model = make_model(scene._replace(raw=raw), appearance=setting, background=setting)
     has_both = spread > 0.01 if setting == "auto" else setting == "on"
     assert model.codes().shape == (8, 4 * has_both)
     assert (model.background is not None) == has_both
@@ -1923,7 +1870,7 @@ def test_an_automatic_mask_goes_off_if_it_marks_nothing_in_training_photos(
         warm, monkeypatch, setting, held_out, trained, wanted):
     warm.cfg.mask = setting
     level = torch.where(warm.scene.is_test, held_out, trained)
-    monkeypatch.setattr(warm.mask, "logits", lambda i: level[i].reshape(-1, 1, 1, 1))
+    monkeypatch.setattr(warm.mask, "logits", lambda i: level[i])
     warm.decide_mask()
     assert warm.cfg.mask == wanted
 
@@ -1947,21 +1894,19 @@ def test_all_but_the_last_two_levels_of_the_background_are_whole(scene, levels):
     assert (count == whole).sum() == levels - 2
 
 
-def test_every_parameter_has_one_group_and_the_rate_of_its_kind(warm):
-    rates = []
+def test_every_parameter_has_a_group_and_the_rate_of_its_kind(warm):
+    rates = {}
     for group, rate in zip(warm.groups(), warm.rates, strict=True):
-        rates += [(id(p), rate) for p in group["params"]]
-    wanted = []
+        rates |= dict.fromkeys(group["params"], rate)
     for name, p in warm.named_parameters():
-        rate = warm.cfg.lr_net
+        wanted = warm.cfg.lr_net
         if name.startswith("mask"):
-            rate = 8e-3
+            wanted = 8e-3
         if "octree" in name:
-            rate = warm.cfg.lr_grid
+            wanted = warm.cfg.lr_grid
         if "appearance" in name:
-            rate = warm.cfg.lr_code
-        wanted.append((id(p), rate))
-    assert sorted(rates) == sorted(wanted)
+            wanted = warm.cfg.lr_code
+        assert rates[p] == wanted, name
 
 
 def test_a_model_starts_as_a_small_sphere_that_the_cache_knows(warm):
@@ -1971,14 +1916,12 @@ def test_a_model_starts_as_a_small_sphere_that_the_cache_knows(warm):
     assert (warm.cache.sdf(x[None])[0] - s).abs().max() < 0.03
 
 
-def test_every_64th_step_renews_the_cache_and_every_one_bounds_zeta(warm):
-    warm.v.data.fill_(2)
+def test_every_64th_step_renews_the_cache(warm):
     for step in range(70):
         warm.cache.volume.fill_(7)
         warm.before_step(step, 0.0)
-        is_renewed = warm.cache.volume != 7
-        assert is_renewed.all() == is_renewed.any() == (step % 64 == 0)
-        close(warm.zeta(), 32 * 8, 1e-4)
+        is_stale = (warm.cache.volume == 7).any()
+        assert is_stale == (step % 64 > 0)
 
 
 @pytest.mark.parametrize("done, floor", [(0.0, 15.0), (0.215, 47.5), (0.43, 80.0), (1.0, 80.0)])
@@ -1989,48 +1932,43 @@ def test_zeta_stays_between_a_floor_that_rises_with_training_and_a_fixed_bound(w
         close(warm.zeta(), min(max(zeta, floor), 32.0 * 8), 1e-4)
 
 
-def test_refining_moves_features_and_adams_moments_along_with_their_corners(warm, monkeypatch):
+def test_refining_moves_features_and_adams_moments_along_with_their_corners(warm):
     optimizer = geonvs.make_optimizer(warm)
-    rays, photos = make_batch(warm)
-    warm.losses(rays, photos, 0, generator())[0].backward()
-    optimizer.step()
     octree = warm.sdf.octree
     old = octree.features
+    old.sum().backward()
+    optimizer.step()
     state = optimizer.state[old]
     number = {key: row for row, key in enumerate(octree.corner_key.tolist(), 1)}
     for table in (old.data, state["exp_avg"], state["exp_avg_sq"]):
         table[:, 1] = torch.arange(1, len(old) + 1)
-    is_open = (octree.cells[:, 0] == 1) & (octree.child == 0)
-    worst = octree.cells[is_open][:40]
-    monkeypatch.setattr(geonvs, "worst_cells", lambda octree: worst)
-    before = octree.split_keys
+    octree.record[:, ::2] = 1  # colours err everywhere
+    worst = geonvs.worst_cells(octree)
+    keys = torch.cat([octree.split_keys, geonvs.number_of(worst)])
     warm.refine(optimizer)
     wanted = [number.get(key, 0) for key in octree.corner_key.tolist()]
-    keys = torch.cat([before, geonvs.number_of(worst)])
     state = optimizer.state[octree.features]
     for table in (octree.features, state["exp_avg"], state["exp_avg_sq"]):
         close(table[:, 1], wanted)
-    assert sorted(octree.split_keys.tolist()) == sorted(keys.tolist())
+    assert torch.equal(octree.split_keys, keys.unique())
     assert 0 in wanted
     assert state["step"] == 1
-    held = [id(p) for group in optimizer.param_groups for p in group["params"]]
-    assert sorted(held) == sorted(id(p) for p in warm.parameters())
+    held = {p for group in optimizer.param_groups for p in group["params"]}
+    assert held == set(warm.parameters())
 
 
 def test_mixed_precision_leaves_the_sdf_alone(warm, monkeypatch):
-    rays, photos = make_batch(warm)
-    full, _, out = warm.losses(rays, photos, 0, generator())
+    batch = make_batch(warm)
+    full, _, out = warm.losses(*batch, 0, generator())
     monkeypatch.setattr(geonvs, "MIXED_ON", {"cpu"})
-    mixed, _, mixed_out = warm.losses(rays, photos, 0, generator())
+    mixed, _, mixed_out = warm.losses(*batch, 0, generator())
     close(mixed, full, 0.01)
     assert mixed != full
     for name in ("opacity", "depth", "e_grad", "e_curv"):
         assert torch.equal(mixed_out[name], out[name])
-    wanted = gradients(warm, full)
-    for name, grad in gradients(warm, mixed).items():
-        if name.startswith("sdf"):
-            assert grad.dtype == torch.float32
-            assert (grad - wanted[name]).norm() < 0.05 * wanted[name].norm()
+    wanted = gradients(warm, full)["sdf.octree.features"]
+    found = gradients(warm, mixed)["sdf.octree.features"]
+    assert (found - wanted).norm() < 0.05 * wanted.norm()
 
 
 class OneDevice(TorchDispatchMode):
@@ -2039,10 +1977,8 @@ class OneDevice(TorchDispatchMode):
     def __torch_dispatch__(self, function, types, args=(), kwargs=None):
         result = function(*args, **(kwargs or {}))
         is_copy = "copy" in str(function)
-        devices = set()
-        for leaf in tree_leaves([args, kwargs, result]):
-            if torch.is_tensor(leaf) and (is_copy or leaf.dim() > 0):
-                devices.add(leaf.device)
+        tensors = filter(torch.is_tensor, tree_leaves([args, kwargs, result]))
+        devices = {x.device for x in tensors if is_copy or x.dim() > 0}
         if len(devices) > 1:
             raise RuntimeError(f"{function} on {devices}")
         return result
@@ -2057,51 +1993,31 @@ def to_meta(value):
     return value.to("meta") if torch.is_tensor(value) else value
 
 
-def train_on_meta(model, monkeypatch):
-    """Takes steps on a device that has no values to be asked for."""
-    monkeypatch.setattr(adam, "_device_dtype_check_for_fused", lambda *args, **kwargs: None)
-    photos = to_meta(model.scene.photos(False))
-    model.scene = geonvs.Scene(*map(to_meta, model.scene))
+@pytest.mark.parametrize("mask", ["on", "off"])
+@pytest.mark.parametrize("parts", ["on", "off"])
+def test_a_step_stays_on_its_device_and_asks_it_for_no_value(scene, monkeypatch, parts, mask):
+    monkeypatch.setattr(adam, "_device_dtype_check_for_fused", mock.Mock())
+    model = make_model(scene, appearance=parts, background=parts, mask=mask)
+    photos = to_meta(scene.photos(False))
+    model.scene = geonvs.Scene(*map(to_meta, scene))
     model.to("meta")
     for module in model.modules():
         for name, value in vars(module).items():
             setattr(module, name, to_meta(value))
     optimizer = geonvs.make_optimizer(model)
-    gen = MetaGenerator()
     with OneDevice():
-        for step in (7, 8):
-            terms = geonvs.training_step(model, optimizer, photos, step, 0.1, gen)
-    return terms
-
-
-@pytest.mark.parametrize("mask", ["on", "off"])
-@pytest.mark.parametrize("parts", ["on", "off"])
-def test_a_step_stays_on_its_device_and_asks_it_for_no_value(scene, monkeypatch, parts, mask):
-    model = make_model(scene, appearance=parts, background=parts, mask=mask)
-    terms = train_on_meta(model, monkeypatch)
+        terms = geonvs.training_step(model, optimizer, photos, 7, 0.1, MetaGenerator())
     assert all(value.device.type == "meta" for value in terms.values())
 
 
-def host_index(mask, rays):
-    return mask.static[torch.zeros(64, dtype=torch.long), 0, 0]
-
-
-def asked_value(mask, phi):
-    return phi.mean() if mask.sum() > 0 else mask.mean()
-
-
-def host_constant(e_grad, e_curv):
-    return e_grad * torch.tensor(10.0).to(e_grad.device) + e_curv
-
-
-@pytest.mark.parametrize("place, name, fault", [
-    (geonvs.TransientMask, "is_static", host_index),
-    (geonvs, "gpl_loss", asked_value),
-    (geonvs, "complexity", host_constant)])
-def test_the_stand_in_for_a_gpu_catches_planted_faults(warm, monkeypatch, place, name, fault):
-    monkeypatch.setattr(place, name, fault)
-    with pytest.raises(RuntimeError):
-        train_on_meta(warm, monkeypatch)
+@pytest.mark.parametrize("fault", [
+    lambda x: x[torch.tensor([0])],
+    lambda x: x.sum().item(),
+    lambda x: x * torch.tensor(10.0).to(x.device)])
+def test_the_stand_in_for_a_gpu_catches_planted_faults(fault):
+    x = torch.zeros(3, device="meta")
+    with OneDevice(), pytest.raises(RuntimeError):
+        fault(x)
 
 
 # ---- 1 settings ----------------------------------------------------------------------------------
@@ -2127,18 +2043,15 @@ def test_a_folder_is_not_taken_for_a_scene_of_its_name():
     assert geonvs.Config(data="taj").source == str(Path.cwd() / "taj")
 
 
-@pytest.mark.parametrize("given, gpus, is_large", [
-    ({}, 1, False),
-    (dict(data="toy"), 1, True),
-    (dict(scene="taj", steps=9), 1, True),
-    (dict(scene="taj"), 0, False)])
+@pytest.mark.parametrize("given, gpus, base", [
+    ({}, 1, {}),
+    (dict(data="toy"), 1, geonvs.LARGE),
+    (dict(scene="taj", steps=9), 1, geonvs.LARGE),
+    (dict(scene="taj"), 0, {})])
 def test_settings_are_defaults_then_large_for_photos_on_a_gpu_then_flags(
-        monkeypatch, given, gpus, is_large):
+        monkeypatch, given, gpus, base):
     monkeypatch.setattr(torch.cuda, "device_count", lambda: gpus)
-    base = geonvs.Config()
-    if is_large:
-        base = geonvs.Config(**geonvs.LARGE)
-    assert geonvs.make_config(given) == replace(base, **given)
+    assert geonvs.make_config(given) == geonvs.Config(**base | given)
 
 
 # ---- 8 energy ------------------------------------------------------------------------------------
@@ -2146,21 +2059,15 @@ def test_settings_are_defaults_then_large_for_photos_on_a_gpu_then_flags(
 CPU = torch.device("cpu")
 
 
-def measure(patch, reads):
-    """Joules on top of 50, whose counter gives these reads, then fails."""
+@pytest.mark.parametrize("reads, wanted", [
+    ([], []),
+    ([1.0], [50]),
+    ([1000.0, 1003.0, 1003.0, 2.0, 6.0], [50, 53, 53, 53, 57])])
+def test_meter_adds_up_what_a_counter_counts_beyond_a_restart_until_it_fails(
+        monkeypatch, capsys, reads, wanted):
     counter = iter(reads).__next__
-    patch.setattr(geonvs, "open_counter", lambda device: counter)
-    return list(geonvs.metered_joules(CPU, 50.0))
-
-
-def test_meter_adds_up_what_a_counter_counts_beyond_a_restart(monkeypatch):
-    joules = measure(monkeypatch, [1000.0, 1003.0, 1003.0, 2.0, 6.0])
-    assert joules == [50, 53, 53, 53, 57]
-
-
-@pytest.mark.parametrize("reads", [[], [1.0], [1.0, 2.0]])
-def test_metering_ends_in_one_line_once_a_counter_fails(monkeypatch, capsys, reads):
-    assert len(measure(monkeypatch, reads)) == len(reads)
+    monkeypatch.setattr(geonvs, "open_counter", lambda device: counter)
+    assert list(geonvs.metered_joules(CPU, 50.0)) == wanted
     assert capsys.readouterr().out.count("energy is null") == 1
 
 
@@ -2169,8 +2076,8 @@ def test_a_cpu_has_no_counter():
         geonvs.open_counter(CPU)
 
 
-@pytest.mark.parametrize("device, processes, joules", [("cuda:0", 1, 7), ("cuda:0", 2, 9)])
-def test_nvml_is_asked_for_the_gpus_that_torch_uses(monkeypatch, device, processes, joules):
+@pytest.mark.parametrize("processes, joules", [(1, 7), (2, 9)])
+def test_nvml_is_asked_for_the_gpus_that_torch_uses(monkeypatch, processes, joules):
     millijoules = {"GPU-0": 7000, "GPU-1": 2000}
     nvml = SimpleNamespace(
         nvmlInit=lambda: None,
@@ -2180,7 +2087,7 @@ def test_nvml_is_asked_for_the_gpus_that_torch_uses(monkeypatch, device, process
     monkeypatch.setattr(geonvs, "RANKS", processes)
     monkeypatch.setattr(
         torch.cuda, "get_device_properties", lambda number: SimpleNamespace(uuid=number))
-    counter = geonvs.open_counter(torch.device(device))
+    counter = geonvs.open_counter(torch.device("cuda"))
     assert counter() == joules
 
 
