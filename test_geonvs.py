@@ -149,7 +149,7 @@ def assert_close(found, wanted, atol=1e-6):
     np.testing.assert_allclose(found, wanted, atol=atol, rtol=1e-5)
 
 
-def run_main(command):
+def run_main(command="place"):
     """Exit code, stdout and stderr of the command line."""
     code = 0
     out, err = io.StringIO(), io.StringIO()
@@ -231,11 +231,10 @@ def test_damaged_scene_files_do_no_harm(desk):
     assert reread(good)
 
 
-@pytest.mark.parametrize("share", [0, .1, .5, .9, .999])
-def test_a_truncated_scene_file_is_refused(desk, share):
+def test_a_truncated_scene_file_is_refused(desk):
     good = zipped(toy())
-    size = int(share * len(good))
-    assert reread(good[:size]) is None
+    for size in (0, 99, 9999, -99, -9):
+        assert reread(good[:size]) is None
 
 
 def refuses(changes):
@@ -269,8 +268,7 @@ def test_a_scene_file_with_values_that_cannot_be_is_refused(desk, keys, value):
 
 
 def test_a_scene_file_whose_photos_do_not_begin_where_others_end_is_refused(desk):
-    start = toy()["start"]
-    assert refuses(dict(start=np.maximum(start, 1)))
+    assert refuses(dict(start=np.maximum(toy()["start"], 1)))
     assert refuses(dict(wh=-toy()["wh"]))
 
 
@@ -309,7 +307,7 @@ def test_a_scene_file_never_runs_code(desk):
 
 
 def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path):
-    path = tmp_path / "sub" / "sub" / "scene.npz"
+    path = tmp_path / "sub/sub/scene.npz"
     data_prep.atomic_write(path, lambda part: part.write_text("old"))
 
     def write(part):
@@ -511,10 +509,8 @@ def sphere(
     images = np.zeros((3, size, size, 3), np.uint8)
     K = np.full((3, 4), 20)
     c2w = [np.eye(3, 4)] * 3
-    points = np.zeros((len(xyz), 5))
-    points[:, :3] = xyz
-    points[:, 3] = error
-    points[:, 4] = views
+    zero = np.zeros(len(xyz))
+    points = np.column_stack([xyz, zero + error, zero + views])
     return data_prep.finish(images, K, c2w, is_test, ["a"] * 3, points, tracks, {}, contain)
 
 
@@ -638,6 +634,12 @@ def test_exposure_spread_is_the_deviation_of_brightness_of_training_photos():
 
 
 # ---- COLMAP folders ------------------------------------------------------------------------------
+SPARSE = Path("place/dense/sparse")
+IMAGES = Path("place/dense/images")
+TABLE = Path("place/toy.tsv")
+PHOTO = IMAGES / "toy_000.png"   # for training; toy_002 and toy_007 are held out
+
+
 @pytest.fixture
 def source():
     return toy(size=40, photos=8)
@@ -647,17 +649,16 @@ def colmap_model(scene):
     """Columns of a COLMAP model, to be changed and written: a row a photo, or a row a point."""
     R = scene["c2w"][:, :, :3].transpose(0, 2, 1)
     x, y, z, w = 2 * Rotation.from_matrix(R).as_quat().T   # of any length
-    t = -R @ world(scene, scene["c2w"][:, :, 3])[:, :, None]
+    t = -np.einsum("nij,nj->ni", R, world(scene, scene["c2w"][:, :, 3]))
     count = len(R)
-    own = [scene["track_point"][scene["track_photo"] == i] for i in range(count)]
     return SimpleNamespace(
         names=scene["name"].tolist(),
         cameras=np.arange(count) + 7,
         kinds=np.ones(count, int),   # PINHOLE
         wh=scene["wh"].copy(),
         numbers=scene["K"].tolist(),
-        poses=np.column_stack([w, x, y, z, t[:, :, 0]]),
-        sightings=own,
+        poses=np.column_stack([w, x, y, z, t]),
+        sightings=[scene["track_point"][scene["track_photo"] == i] for i in range(count)],
         x=world(scene, scene["points"].astype(float)),
         errors=np.full(len(scene["points"]), .5),
         views=np.bincount(scene["track_point"]))
@@ -667,7 +668,7 @@ def pack(layout, *values):
     return struct.pack("<" + layout, *values)
 
 
-def write_model(folder, model):
+def write_model(model, folder=SPARSE):
     cameras = pack("iiQQ8d", 99, 5, 0, 0, *[np.nan] * 8)   # of no photo, a broken fisheye
     images = b""
     points = b""
@@ -690,13 +691,13 @@ def write_model(folder, model):
     Path(folder, "points3D.bin").write_bytes(pack("Q", len(model.x)) + points)
 
 
-def write_folder(folder, scene, images="dense/images", sparse="dense/sparse"):
+def write_folder(scene, images="dense/images", sparse="dense/sparse", folder="place"):
     """Photos, model and split table; the model's columns."""
     model = colmap_model(scene)
-    write_model(folder / sparse, model)
+    write_model(model, Path(folder, sparse))
     rows = ["split\tfilename"]
     for i, name in enumerate(model.names):
-        path = folder / images / name
+        path = Path(folder, images, name)
         path.parent.mkdir(parents=True, exist_ok=True)
         cv2.imwrite(str(path), photo(scene, i)[..., ::-1])
         part = "test" if scene["is_test"][i] else "train"
@@ -707,13 +708,7 @@ def write_folder(folder, scene, images="dense/images", sparse="dense/sparse"):
 
 @pytest.fixture
 def model(desk, source):
-    return write_folder(desk / "place", source)
-
-
-SPARSE = Path("place/dense/sparse")
-IMAGES = Path("place/dense/images")
-TABLE = Path("place/toy.tsv")
-PHOTO = IMAGES / "toy_000.png"   # for training; toy_002 and toy_007 are held out
+    return write_folder(source)
 
 
 @pytest.mark.parametrize("images, sparse", [
@@ -725,8 +720,8 @@ PHOTO = IMAGES / "toy_000.png"   # for training; toy_002 and toy_007 are held ou
     (".", "sparse")])
 def test_a_scene_survives_the_way_through_colmap_files_wherever_they_lie(
         desk, source, images, sparse):
-    write_folder(desk / "place", source, images, sparse)
-    scene = data_prep.prepare("place", downscale=1)
+    write_folder(source, images, sparse)
+    scene = data_prep.prepare("place", 1)
     assert_same(scene, source, "rgb", "is_test", "name", "wh", "track_photo", "track_point")
     assert_close(scene["K"], source["K"])
     assert_close(scene["c2w"][..., :3], source["c2w"][..., :3])
@@ -735,7 +730,7 @@ def test_a_scene_survives_the_way_through_colmap_files_wherever_they_lie(
 
 
 def test_the_cameras_of_photos_shrink_with_them(model, source):
-    small = data_prep.prepare("place", downscale=3)
+    small = data_prep.prepare("place", 3)
     share = source["wh"] // 3 / source["wh"]
     assert np.array_equal(small["wh"], source["wh"] // 3)
     assert_close(small["K"], source["K"] * np.tile(share, 2))
@@ -744,7 +739,7 @@ def test_the_cameras_of_photos_shrink_with_them(model, source):
 def test_photos_shrink_as_a_mean(model):
     stripes = np.arange(40, dtype=np.uint8) % 2 * 254
     cv2.imwrite(str(PHOTO), np.tile(stripes, (27, 1)))
-    small = data_prep.prepare("place", downscale=2)
+    small = data_prep.prepare("place")
     assert_close(photo(small, 0), 127)
 
 
@@ -770,7 +765,7 @@ def test_an_undistorted_photo_shows_nothing_but_photo_where_its_camera_says(
     model.kinds[0] = number
     model.wh[0] = 90, 60
     model.numbers[0] = [*focal, 44, 31, *distortion]
-    write_model(SPARSE, model)
+    write_model(model)
     scene = data_prep.prepare("place", 1)
     d = data_prep.rays(scene["K"][0], np.eye(3), 90, 60)
     padded = np.append(distortion, np.zeros(7))[:8]
@@ -785,7 +780,7 @@ def test_very_narrow_and_very_wide_photos_are_left_out_of_training_only(model, s
     angles = [9.9, 120.1, 5, 10.1, 119.9, 60, 60, 170, 60, 60]   # toy_002 and 007 are held out
     for i, f in enumerate(20 / np.tan(np.radians(angles) / 2)):   # the long side has 40 px
         model.numbers[i] = f, f, 20, 20
-    write_model(SPARSE, model)
+    write_model(model)
     scene = data_prep.prepare("place")
     assert scene["name"].tolist() == source["name"].tolist()[2:]
 
@@ -793,18 +788,18 @@ def test_very_narrow_and_very_wide_photos_are_left_out_of_training_only(model, s
 @pytest.mark.parametrize("far", [1e300, -1e30, np.inf, np.nan])
 def test_points_absurdly_far_away_do_no_harm(model, far):
     model.views[:2] = 0
-    write_model(SPARSE, model)
+    write_model(model)
     clean = data_prep.prepare("place")
     model.views[:2] = 9
     model.x[0, 2] = far
     model.errors[1] = far
-    write_model(SPARSE, model)
+    write_model(model)
     with np.errstate(all="raise"):
         scene = data_prep.prepare("place")
     assert_same(scene, clean, "points", "track_point", "c2w", "near", "scale")
 
 
-def assert_error(command, says):
+def assert_error(says, command="place"):
     code, out, err = run_main(command)
     assert code == 2
     assert says in err
@@ -818,8 +813,8 @@ def assert_error(command, says):
     ("kinds", 77, "run colmap image_undistorter")])
 def test_a_model_that_cannot_be_used_is_an_error(model, column, value, says):
     getattr(model, column)[:] = value
-    write_model(SPARSE, model)
-    assert_error("place", says)
+    write_model(model)
+    assert_error(says)
 
 
 @pytest.mark.parametrize("name, says", [
@@ -828,8 +823,8 @@ def test_a_model_that_cannot_be_used_is_an_error(model, column, value, says):
     ("..\\toy_000.png", "outside")])
 def test_names_must_be_different_and_within_the_folder(model, name, says):
     model.names[0] = name
-    write_model(SPARSE, model)
-    assert_error("place", says)
+    write_model(model)
+    assert_error(says)
 
 
 @pytest.mark.parametrize("path, says", [
@@ -838,11 +833,11 @@ def test_names_must_be_different_and_within_the_folder(model, name, says):
     (SPARSE / "points3D.bin", "points3D.bin is missing: copy the whole model, or for points run")])
 def test_what_is_missing_is_said(model, path, says):
     path.rename("elsewhere")
-    assert_error("place", says)
+    assert_error(says)
 
 
 def assert_left_out(says):
-    code, out, err = run_main("place")
+    code, out, err = run_main()
     assert "9 photos, 2 of them for testing" in out
     assert err.startswith("left out: toy_000.png ")
     assert says in err
@@ -857,7 +852,7 @@ def assert_left_out(says):
     ("cameras", 12345, "no camera in the model")])
 def test_a_training_photo_without_sound_records_is_left_out_and_named(model, column, value, says):
     getattr(model, column)[0] = value
-    write_model(SPARSE, model)
+    write_model(model)
     assert_left_out(says)
 
 
@@ -877,8 +872,8 @@ def test_a_training_photo_that_cannot_be_read_is_left_out_and_named(model, data,
 
 def test_all_photos_that_cannot_be_used_are_found_in_one_go_and_a_held_out_one_is_an_error(model):
     model.poses[[0, 4, 7]] = np.nan
-    write_model(SPARSE, model)
-    code, out, err = run_main("place")
+    write_model(model)
+    code, out, err = run_main()
     assert code == 2
     assert re.findall("left out: (.*).png has", err) == ["toy_000", "toy_004", "toy_007"]
     assert err.endswith("mend them or hold out others: ['toy_007.png']\n")
@@ -886,10 +881,10 @@ def test_all_photos_that_cannot_be_used_are_found_in_one_go_and_a_held_out_one_i
 
 def test_of_several_models_the_largest_is_taken_and_what_that_leaves_out_is_said(model):
     model.names = model.names[:4]
-    write_model(Path("place/dense/sparse/1"), model)
+    write_model(model, Path("place/dense/sparse/1"))
     shutil.copy(PHOTO, IMAGES / "more.JPG")
     Path(IMAGES, "toy_003.png").unlink()
-    code, out, err = run_main("place")
+    code, out, err = run_main()
     assert "10 photos on disk, 9 posed by place/dense/sparse\n" in out
     assert "4 posed by place/dense/sparse/1" in out
     assert "1 photos of place/dense/sparse are not on disk, such as ['toy_003.png']" in err
@@ -897,8 +892,8 @@ def test_of_several_models_the_largest_is_taken_and_what_that_leaves_out_is_said
 
 def test_of_equal_models_one_that_can_be_used_is_taken_without_a_word(model):
     model.cameras[:] = 99
-    write_model(Path("place/dense/models"), model)
-    code, out, err = run_main("place")
+    write_model(model, Path("place/dense/models"))
+    code, out, err = run_main()
     assert "10 posed by place/dense/sparse\n" in out
     assert "left out" not in out + err
 
@@ -906,9 +901,9 @@ def test_of_equal_models_one_that_can_be_used_is_taken_without_a_word(model):
 def test_photos_are_found_by_names_with_folders_behind_links_and_as_windows_wrote_them(
         desk, source):
     names = [f"a b/ü {i}.ppm" for i in range(10)]
-    model = write_folder(Path("place"), source | dict(name=np.array(names)))
+    model = write_folder(source | dict(name=np.array(names)))
     model.names = [name.replace("/", "\\") for name in names]
-    write_model(SPARSE, model)
+    write_model(model)
     shutil.move(IMAGES / "a b", "elsewhere")
     Path(IMAGES, "a b").symlink_to(desk / "elsewhere")
     scene = data_prep.prepare("place", 1)
@@ -917,14 +912,13 @@ def test_photos_are_found_by_names_with_folders_behind_links_and_as_windows_wrot
 
 
 @pytest.mark.parametrize("count, code, says", [
-    (8, 2, "give poses as COLMAP does, world to camera, x right, y down"),
-    (2, 0, "only")])
+    (8, 2, "that saw them: give poses as COLMAP does, world to camera, x right, y down"),
+    (2, 0, "of all sightings of points fall into the photo that saw them")])
 def test_poses_that_contradict_the_photos_are_refused_if_many_and_said_if_few(
         model, count, code, says):
-    w, x, y, z, *t = model.poses[:count].T
-    model.poses[:count] = np.transpose([-x, w, -z, y, t[0], -t[1], -t[2]])   # as OpenGL has it
-    write_model(SPARSE, model)
-    found, out, err = run_main("place")
+    model.poses[:count, 4] += 99   # to the side
+    write_model(model)
+    found, out, err = run_main()
     assert found == code
     assert says in err
 
@@ -932,18 +926,12 @@ def test_poses_that_contradict_the_photos_are_refused_if_many_and_said_if_few(
 def test_points_in_smaller_units_than_poses_are_refused(model):
     centre = model.x.mean(0)
     model.x[:] = centre + (model.x - centre) / 1000
-    write_model(SPARSE, model)
-    assert_error("place", "in the units of the points")
-
-
-def test_points_outside_most_of_the_photos_that_saw_them_are_refused(model):
-    model.poses[:, 4] += 6   # to the side
-    write_model(SPARSE, model)
-    assert_error("place", "of all sightings of points fall into the photo that saw them")
+    write_model(model)
+    assert_error("in the units of the points")
 
 
 def test_a_sound_folder_gives_no_warning_but_the_radius_and_the_share_of_points_inside(model):
-    code, out, err = run_main("place")
+    code, out, err = run_main()
     scene = data_prep.open_scene("place")
     share = (lengths(scene["points"]) < 1).mean()
     assert not err
@@ -1010,7 +998,7 @@ def test_lists_of_training_and_test_photos_are_used(model, command):
 def test_one_list_of_photos_is_not_enough(model):
     TABLE.unlink()
     Path("place/train_list.txt").write_text("toy_000.png")
-    assert_error("place", "test_list.txt is missing")
+    assert_error("test_list.txt is missing")
 
 
 def test_without_a_table_every_eighth_photo_is_held_out_and_that_is_said(model):
@@ -1023,7 +1011,7 @@ def test_without_a_table_every_eighth_photo_is_held_out_and_that_is_said(model):
 def test_names_with_another_folder_or_extension_are_said_to_be_such(model):
     text = TABLE.read_text().replace("toy_000.png", "images/toy_000.jpg")
     TABLE.write_text(text + "\ntrain\tghost.png")
-    code, out, err = run_main("place")
+    code, out, err = run_main()
     assert "images/toy_000.jpg has no pose or no file" in err
     assert "of other folder or extension: ['toy_000.png']" in err
     assert "ghost.png has no pose or no file; of other folder or extension: []" in err
@@ -1031,12 +1019,12 @@ def test_names_with_another_folder_or_extension_are_said_to_be_such(model):
 
 def test_a_table_with_fewer_than_two_training_photos_is_an_error(model):
     TABLE.write_text("filename\tsplit\ntoy_000.png\ttrain")
-    assert_error("place", "1 usable training photos are too few")
+    assert_error("1 usable training photos are too few")
 
 
 def test_among_several_tables_one_must_be_chosen(model):
     shutil.copy(TABLE, "place/b.tsv")
-    assert_error("place", "choose a split file by --split: place/b.tsv, place/toy.tsv")
+    assert_error("choose a split file by --split: place/b.tsv, place/toy.tsv")
     assert held_out("place --split place/toy.tsv")[0] == ["toy_002.png", "toy_007.png"]
 
 
@@ -1073,7 +1061,7 @@ def test_a_scene_is_made_anew_when_a_photo_or_a_model_goes_or_comes(model):
     assert makes()
     PHOTO.unlink()
     assert makes()
-    write_model(Path("place/sparse"), model)
+    write_model(model, Path("place/sparse"))
     assert makes()
 
 
@@ -1112,7 +1100,7 @@ def test_a_toy_is_made_once(desk, monkeypatch):
 def test_scenes_that_are_known_by_name_lie_in_data(desk, source, home):
     with pytest.raises(UserError, match="python data_prep.py sacre --download"):
         data_prep.open_scene("sacre")
-    write_folder(desk / home, source)
+    write_folder(source, folder=home)
     assert len(data_prep.open_scene("sacre")["wh"]) == 10
     assert Path("data/sacre.npz").exists()
 
@@ -1126,7 +1114,7 @@ def damaged(tmp_path, source, request):
     model.x = model.x[:3]
     model.views[:3] = 2
     model.sightings = np.zeros((2, 1), int)
-    write_model(tmp_path, model)
+    write_model(model, tmp_path)
     path = tmp_path / request.param
 
     def read(data):
@@ -1279,10 +1267,7 @@ def test_the_command_line_makes_a_toy_with_any_knob(desk):
     assert code == 0
     assert "data/toy.npz: 8 photos, 2 of them" in out
     assert_same(scene, toy(occluders=.2, background=False, seed=1))
-
-
-def test_another_seed_makes_other_photos():
-    assert (toy()["c2w"] != toy(seed=1)["c2w"]).any()
+    assert (scene["K"] != toy()["K"]).any()   # of another seed
 
 
 WRONG = """
@@ -1316,7 +1301,7 @@ x --download
 
 @pytest.mark.parametrize("command", WRONG.splitlines())   # the first has no word
 def test_misspelt_commands_exit_with_2(model, command):
-    assert_error(command, "error: ")
+    assert_error("error: ", command)
 
 
 @pytest.mark.parametrize("error, says", [
@@ -1325,9 +1310,7 @@ def test_misspelt_commands_exit_with_2(model, command):
 def test_what_stops_a_command_is_one_sentence(desk, monkeypatch, error, says):
     stop = mock.create_autospec(data_prep.make_toy, side_effect=error)
     monkeypatch.setattr(data_prep, "make_toy", stop)
-    code, out, err = run_main("toy")
-    assert code == 2
-    assert re.fullmatch(f"error: .*{says}.*\n", err)
+    assert_error(says, "toy")
 
 
 @pytest.fixture
@@ -1337,7 +1320,7 @@ def pycolmap(desk, monkeypatch, source):
     few = SimpleNamespace(num_reg_images=lambda: 2)
     most = SimpleNamespace(num_reg_images=lambda: 9)
     fake.incremental_mapping.return_value = {0: few, 1: most, 2: few}
-    fake.undistort_images.side_effect = lambda *_: write_folder(Path("raw"), source)
+    fake.undistort_images.side_effect = lambda *_: write_folder(source, folder="raw")
     monkeypatch.setitem(sys.modules, "pycolmap", fake)
     Path("raw/images").mkdir(parents=True)
     return fake
@@ -1358,17 +1341,17 @@ def test_sfm_calls_pycolmap_in_order_and_undistorts_the_largest_model(pycolmap):
 
 def test_photos_are_not_posed_twice(pycolmap):
     Path("raw/dense").mkdir()
-    assert_error("raw --sfm", "has dense/")
+    assert_error("has dense/", "raw --sfm")
 
 
 def test_sfm_says_when_photos_do_not_match(pycolmap):
     pycolmap.incremental_mapping.return_value = {}
-    assert_error("raw --sfm", "overlap")
+    assert_error("overlap", "raw --sfm")
 
 
 def test_sfm_says_when_pycolmap_is_missing(pycolmap, monkeypatch):
     monkeypatch.setitem(sys.modules, "pycolmap", None)
-    assert_error("raw --sfm", "pycolmap")
+    assert_error("pycolmap", "raw --sfm")
 
 
 # ---- 2 scene file and rays -----------------------------------------------------------------------
