@@ -1976,31 +1976,37 @@ def to_meta(value):
     return value.to("meta") if torch.is_tensor(value) else value
 
 
-@pytest.mark.parametrize("mask", ["on", "off"])
-@pytest.mark.parametrize("parts", ["on", "off"])
-def test_a_step_stays_on_its_device_and_asks_it_for_no_value(scene, monkeypatch, parts, mask):
+def train_on_meta(model, monkeypatch):
+    """Takes steps on a device that has no values to be asked for."""
     monkeypatch.setattr(adam, "_device_dtype_check_for_fused", mock.Mock())
-    model = make_model(scene, appearance=parts, background=parts, mask=mask)
-    photos = to_meta(scene.photos(False))
-    model.scene = geonvs.Scene(*map(to_meta, scene))
+    photos = to_meta(model.scene.photos(False))
+    model.scene = geonvs.Scene(*map(to_meta, model.scene))
     model.to("meta")
     for module in model.modules():
         for name, value in vars(module).items():
             setattr(module, name, to_meta(value))
     optimizer = geonvs.make_optimizer(model)
     with OneDevice():
-        terms = geonvs.training_step(model, optimizer, photos, 7, 0.1, MetaGenerator())
-    assert all(value.device.type == "meta" for value in terms.values())
+        for step, done in ((7, 0.1), (64, 0.7)):
+            geonvs.training_step(model, optimizer, photos, step, done, MetaGenerator())
+
+
+@pytest.mark.parametrize("mask", ["on", "off"])
+@pytest.mark.parametrize("parts", ["on", "off"])
+def test_a_step_stays_on_its_device_and_asks_it_for_no_value(scene, monkeypatch, parts, mask):
+    model = make_model(scene, appearance=parts, background=parts, mask=mask)
+    train_on_meta(model, monkeypatch)
+    assert model.v.grad.is_meta
 
 
 @pytest.mark.parametrize("fault", [
-    lambda x: x[torch.tensor([0])],
-    lambda x: x.sum().item(),
-    lambda x: x * torch.tensor(10.0).to(x.device)])
-def test_the_stand_in_for_a_gpu_catches_planted_faults(fault):
-    x = torch.zeros(3, device="meta")
-    with OneDevice(), pytest.raises(RuntimeError):
-        fault(x)
+    lambda mask, phi: phi[torch.tensor([0])],
+    lambda mask, phi: mask.mean() if phi.sum() > 0 else phi.mean(),
+    lambda mask, phi: mask.mean() * torch.tensor(10.0).to(phi.device)])
+def test_the_stand_in_for_a_gpu_catches_planted_faults(warm, monkeypatch, fault):
+    monkeypatch.setattr(geonvs, "gpl_loss", fault)
+    with pytest.raises(RuntimeError):
+        train_on_meta(warm, monkeypatch)
 
 
 # ---- 1 settings ----------------------------------------------------------------------------------
