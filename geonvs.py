@@ -136,11 +136,10 @@ class Config:
 
     def __post_init__(self):
         """Refuses numbers that cannot work, before anything is written."""
-        for setting in fields(self):
-            value = getattr(self, setting.name)
-            least = AT_LEAST.get(setting.name, 0)
-            check(setting.type is str or least <= value < 2**31,
-                  f"--{setting.name} {value} is out of range: use {least} to 2^31 - 1")
+        for name, value in vars(self).items():
+            least = AT_LEAST.get(name, 0)
+            check(isinstance(value, str) or least <= value < 2**31,
+                  f"--{name} {value} is out of range: use {least} to 2^31 - 1")
 
     @property
     def source(self):
