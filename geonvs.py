@@ -1118,7 +1118,7 @@ def read_checkpoint(path, given):
                         f"({type(error).__name__}): train again under another --name") from None
 
 
-def restore(saved, path, model, gen=None):
+def restore(saved, model, gen=None):
     """Puts a checkpoint's weights into a model, and its random numbers into gen, which must be of
     the same kind of device; returns its optimiser and State."""
     try:
@@ -1132,8 +1132,8 @@ def restore(saved, path, model, gen=None):
             gen.set_state(saved["generator"])
         return optimizer, State(**saved["state"])
     except Exception as error:  # as in read_checkpoint
-        raise UserError(f"{path} does not fit this scene and these settings ({error!r:.90}): use "
-                        "flags and kind of device as it was made with, or another --name") from None
+        raise UserError(f"checkpoint.pt does not fit scene and settings ({error!r:.90}): use flags "
+                        "and kind of device as it was made with, or another --name") from None
 
 
 def train(cfg, scene, run, saved=None, kind=GeoNVS):
@@ -1144,13 +1144,12 @@ def train(cfg, scene, run, saved=None, kind=GeoNVS):
     gen = torch.Generator(scene.c2w.device).manual_seed(cfg.seed + RANK)
     with gen.device:
         model = kind(cfg, scene)
-    path = run / "checkpoint.pt"
     stale = RESULTS
     if saved is None:
         optimizer = make_optimizer(model)
         state = State()
     else:
-        optimizer, state = restore(saved, path, model, gen)
+        optimizer, state = restore(saved, model, gen)
         stale = RESULTS[2:]  # checkpoint and log go on
     for name in stale:  # nothing of a former run may be taken for this one's
         (run / name).unlink(missing_ok=True)
@@ -1179,7 +1178,7 @@ def train(cfg, scene, run, saved=None, kind=GeoNVS):
             next_log = state.seconds + PAUSE
             state.joules = next(meter, None)  # None, never 0, once a counter has failed
             report(model, run / "log.jsonl", done, state, terms)
-            save_checkpoint(path, model, optimizer, gen, state)
+            save_checkpoint(run / "checkpoint.pt", model, optimizer, gen, state)
     return model, state
 
 
@@ -1536,12 +1535,11 @@ def main(argv=None):
     cfg = make_config(given)
     name = f"{data_prep.scene_path(cfg.source).stem}-{GeoNVS.name}-{cfg.seed}"
     run = Path("runs", cfg.name or name)
-    path = run / "checkpoint.pt"
     saved = None
     if resume or render:
         if "steps" in given:
             given.setdefault("minutes", 0.0)  # of two budgets the last one given
-        saved, cfg = read_checkpoint(path, given)
+        saved, cfg = read_checkpoint(run / "checkpoint.pt", given)
     check(cfg.rays % (cfg.photos * RANKS) == 0,
           f"--rays {cfg.rays} must be a multiple of --photos {cfg.photos} times {RANKS} processes")
     device = pick_device(cfg.device)
@@ -1554,7 +1552,7 @@ def main(argv=None):
     if render:
         with device:
             model = GeoNVS(cfg, scene)
-        restore(saved, path, model)
+        restore(saved, model)
         if RANK == 0:
             film(model, scene, run / "film.mp4")
     else:

@@ -2300,7 +2300,7 @@ def test_a_bad_checkpoint_is_refused_in_one_sentence(desk):
     for data in files:
         CHECKPOINT.write_bytes(data)
         with pytest.raises(UserError, match="^.*checkpoint.pt.*$"):  # of one line
-            geonvs.restore(read_saved(), CHECKPOINT, model, generator())
+            geonvs.restore(read_saved(), model, generator())
         assert CHECKPOINT.read_bytes() == data
     assert not Path("harm").exists()
 
@@ -2320,7 +2320,7 @@ def test_a_checkpoint_of_another_kind_of_device_renders_but_does_not_go_on(loop)
     model, _ = run_training()
     saved = read_saved()
     saved["generator"] = torch.zeros(16).byte()  # a GPU's
-    geonvs.restore(saved, CHECKPOINT, model)
+    geonvs.restore(saved, model)
     with pytest.raises(UserError, match="kind of device"):
         run_training(saved)
 
