@@ -1115,7 +1115,7 @@ def read_checkpoint(path, given):
         return saved, Config(**saved["config"] | given)
     except Exception as error:  # a damaged file can fail in any layer: zip, pickle, tensor storage
         raise UserError(f"{path} is damaged, too large for the memory or of another program "
-                        f"({type(error).__name__}): train again under another --name") from None
+                        f"({type(error).__name__}): train again under another --name")
 
 
 def restore(saved, model, gen=None):
@@ -1133,7 +1133,7 @@ def restore(saved, model, gen=None):
         return optimizer, State(**saved["state"])
     except Exception as error:  # as in read_checkpoint
         raise UserError(f"checkpoint.pt does not fit scene and settings ({error!r:.90}): use flags "
-                        "and kind of device as it was made with, or another --name") from None
+                        "and kind of device as it was made with, or another --name")
 
 
 def train(cfg, scene, run, saved=None, kind=GeoNVS):
