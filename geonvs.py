@@ -1188,7 +1188,7 @@ def report(model, path, done, state, terms):
           "weights are no longer finite: mend poses, or try a third of the learning rates "
           f"--lr_grid and --lr_net; checkpoint.pt beside {path}, if any, is from before")
     numbers = {key: value.item() for key, value in terms.items()}
-    numbers["psnr"] = -10 * math.log10(max(numbers["mse"], 1e-10))
+    numbers["psnr"] = -10 * math.log10(numbers["mse"] + 1e-10)
     with open(path, "a") as file:
         print(json.dumps(vars(state) | numbers), file=file)
     print(f"  {min(done, 1):4.0%}  step {state.step}  psnr {numbers['psnr']:.2f}", flush=True)
@@ -1203,8 +1203,8 @@ def to_uint8(picture):
 
 def psnr(a, b):
     """Peak signal-to-noise ratio in dB of two pictures in 0..1, numpy or torch; at most 100."""
-    error = ((a - b) ** 2).mean()
-    return -10 * math.log10(max(error, 1e-10))
+    mse = ((a - b) ** 2).mean()
+    return -10 * math.log10(mse + 1e-10)
 
 
 def make_lpips():
