@@ -1173,8 +1173,8 @@ def train(cfg, scene, run, saved=None, kind=GeoNVS):
             model.decide_mask()
         if done >= 1:
             model.before_step(0, 1.0)  # pictures follow the last weights
-        is_due = done >= 1 or state.seconds >= next_log
-        if RANK == 0 and is_due:
+            next_log = 0.0  # the last step is logged and saved
+        if RANK == 0 and state.seconds >= next_log:
             next_log = state.seconds + PAUSE
             state.joules = next(meter, None)  # None, never 0, once a counter has failed
             report(model, run / "log.jsonl", done, state, terms)
