@@ -1509,7 +1509,7 @@ def make_config(given):
 
 def execute(cfg, scene, run, saved=None, kind=GeoNVS):
     """Trains and scores one model; returns its metrics, in the first process."""
-    run.mkdir(parents=True, exist_ok=True)
+    os.makedirs(run, exist_ok=True)
     print(f"{kind.name} on {scene.info['scene']}: {len(scene.wh)} photos, "
           f"{len(scene.photos(True))} held out; {scene.c2w.device}; {run}/")
     model, state = train(cfg, scene, run, saved, kind)
