@@ -1267,7 +1267,7 @@ def score(rgb, truth, lpips=None):
     sigma 1.5, no border. None where a picture is too small."""
     half = truth.shape[1] // 2
     want = truth[:, half:]
-    got = to_uint8(rgb[:, half:]) / np.float32(255)
+    got = to_uint8(rgb[:, half:]) / 255
     side = min(got.shape[:2])
     row = dict(
         psnr=psnr(got, want),
@@ -1275,15 +1275,15 @@ def score(rgb, truth, lpips=None):
         ssim=None,
         lpips=None)
     if side >= 11:
-        row["ssim"] = float(structural_similarity(
+        row["ssim"] = structural_similarity(
             got,
             want,
             channel_axis=2,
             data_range=1,
             gaussian_weights=True,
-            use_sample_covariance=False))
+            use_sample_covariance=False)
     if lpips and side >= 32:
-        a, b = [torch.tensor(x).permute(2, 0, 1)[None] for x in (got, want)]  # (1,3,H,W)
+        a, b = [torch.tensor(x).float().permute(2, 0, 1)[None] for x in (got, want)]  # (1,3,H,W)
         row["lpips"] = lpips(a, b, normalize=True).item()
     return row
 
