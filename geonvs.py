@@ -1197,8 +1197,8 @@ def report(model, path, done, state, terms):
 # ---- 10 Scoring, mesh, pictures ------------------------------------------------------------------
 
 def to_uint8(picture):
-    """Numbers in 0..1, numpy or torch, as bytes in numpy."""
-    return (np.asarray(picture).clip(0, 1) * 255 + 0.5).astype(np.uint8)
+    """Numbers in 0..1 as bytes."""
+    return (picture.clip(0, 1) * 255 + 0.5).astype(np.uint8)
 
 
 def psnr(a, b):
