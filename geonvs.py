@@ -1237,7 +1237,8 @@ def fit_codes(model, scene, photos, steps=128, n=64):
         rays = random_rays(scene, img, gen, part=0.5)
         rgb = model.render(rays, codes.repeat_interleave(n, 0))["rgb"]
         loss = (rgb - rays.rgb).abs().mean()
-        [codes.grad] = torch.autograd.grad(loss, codes)  # the model's weights get none
+        adam.zero_grad()
+        loss.backward(inputs=codes)  # the model's weights get no gradient
         adam.step()
     return codes.detach()
 
