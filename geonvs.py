@@ -1396,8 +1396,8 @@ def write_panel(path, model, scene, codes):
         h, w, _ = rgb.shape
         size = (240, 240 * h // w)
         row = [cv2.resize(to_uint8(tile), size, interpolation=cv2.INTER_AREA) for tile in tiles]
-        row = np.pad(np.hstack(row), ((20, 0), (0, 0), (0, 0)), constant_values=255)
-        cv2.putText(row, text, (2, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.4, (0, 0, 0))
+        row = np.insert(np.hstack(row), [0] * 20, 255, axis=0)  # 20 white lines for the title
+        cv2.putText(row, text, (2, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.4, 0)
         rows.append(row)
     atomic_write(path, lambda part: cv2.imwrite(str(part), np.vstack(rows)[:, :, ::-1]))
 
