@@ -1447,20 +1447,19 @@ def finish(model, scene, state, run):
 def film(model, scene, path):
     """mp4 at 24 frames/s: the first training camera sways sideways, by a tenth of the sphere's
     radius, while its photo's light turns into the last photo's."""
-    photos = scene.photos(False)[[0, -1]]
-    first, last = model.codes()[photos]  # (A,)
-    photo = photos[0].item()
-    w, h = (scene.wh[photo] // 2 * 2).tolist()  # codecs want even sides
+    photo, other = scene.photos(False)[[0, -1]].tolist()
+    first, last = model.codes()[[photo, other]]  # (A,)
+    size = scene.wh[photo].tolist()  # px; of an odd side cv2 leaves out the last pixel
 
     def write(part):
-        video = cv2.VideoWriter(str(part), cv2.VideoWriter_fourcc(*"mp4v"), 24, (w, h))
+        video = cv2.VideoWriter(str(part), cv2.VideoWriter_fourcc(*"mp4v"), 24, size)
         for n in progress(range(96), "filming 96 frames"):
             share = n / 95
             c2w = scene.c2w.clone()
             c2w[:, :, 3] += 0.1 * math.sin(math.tau * share) * c2w[:, :, 0]
             view = scene._replace(c2w=c2w)
             rgb, _, _ = render_photo(model, view, photo, first.lerp(last, share))
-            video.write(to_uint8(rgb[:h, :w, ::-1]))
+            video.write(to_uint8(rgb[:, :, ::-1]))
         video.release()
         return part.stat().st_size > 0
     atomic_write(path, write)

@@ -2585,10 +2585,12 @@ def test_a_panel_shows_photo_render_normals_and_a_mask_from_left_to_right(
 
 def test_a_film_sways_sideways_from_the_light_of_one_photo_to_anothers(
         warm, odd, desk, monkeypatch):
-    frame = np.full((32, 32, 3), [1.0, 0, 0])
+    small = odd._replace(wh=odd.wh - 1)  # a codec wants even sides
+    w, h = small.wh[0].tolist()
+    frame = np.full((h, w, 3), [1.0, 0, 0])
     render_photo = mock.Mock(return_value=(frame, None, None))
     monkeypatch.setattr(geonvs, "render_photo", render_photo)
-    geonvs.film(warm, odd, Path("a.mp4"))
+    geonvs.film(warm, small, Path("a.mp4"))
     calls = [call.args for call in render_photo.call_args_list]
     _, views, photos, lights = zip(*calls)
     cameras = torch.stack([view.c2w[0] for view in views])
