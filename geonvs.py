@@ -1468,15 +1468,11 @@ def film(model, scene, path):
 
 # ---- 11 Command line -----------------------------------------------------------------------------
 
-class Parser(argparse.ArgumentParser):
-    def error(self, message):
-        raise UserError(f"{message}: see --help")
-
-
 def make_parser():
-    parser = Parser(
+    parser = argparse.ArgumentParser(
         description=__doc__.splitlines()[0],
         epilog=f"[Dn]: see geonvs.py's head. Photos on a GPU: {LARGE}",
+        usage=argparse.SUPPRESS,  # so a mistake ends in one sentence
         argument_default=argparse.SUPPRESS)
     comments = dict(re.findall(r"(\w+): .+  # (.+)", inspect.getsource(Config)))
     for setting in fields(Config):
