@@ -1472,14 +1472,14 @@ def make_parser():
     parser = argparse.ArgumentParser(
         description=__doc__.splitlines()[0],
         epilog=f"[Dn]: see geonvs.py's head. Photos on a GPU: {LARGE}",
-        usage=argparse.SUPPRESS,  # so a mistake ends in one sentence
-        argument_default=argparse.SUPPRESS)
+        usage=argparse.SUPPRESS)  # so a mistake ends in one sentence
     comments = dict(re.findall(r"(\w+): .+  # (.+)", inspect.getsource(Config)))
     for setting in fields(Config):
         parser.add_argument(
             f"--{setting.name}",
             type=setting.type,
             choices=CHOICES.get(setting.name),
+            default=argparse.SUPPRESS,  # for make_config, which has to know what was given
             help=f"{comments[setting.name]} [{setting.default}]")
     parser.add_argument("--resume", action="store_true", help="go on from the run's checkpoint")
     parser.add_argument("--render", action="store_true", help="film a finished run")
@@ -1526,8 +1526,8 @@ def start_processes(device):
 
 def main(argv=None):
     given = vars(make_parser().parse_args(argv))
-    resume = given.pop("resume", False)
-    render = given.pop("render", False)
+    resume = given.pop("resume")
+    render = given.pop("render")
     cfg = make_config(given)
     name = f"{data_prep.scene_path(cfg.source).stem}-{GeoNVS.name}-{cfg.seed}"
     run = Path("runs", cfg.name or name)

@@ -3541,14 +3541,13 @@ def experiment(argv):
     parser = geonvs.make_parser()
     parser.add_argument("experiment", choices=("chart", "pieces", "grid", "stress"))
     parser.add_argument("--seeds", type=int, default=3, help="seeds of every row [3]")
-    parser.add_argument(
-        "--published", action="store_true", default=False, help="rivals at published size")
+    parser.add_argument("--published", action="store_true", help="rivals at published size")
     given = vars(parser.parse_args(argv))
     name = given.pop("experiment")
     seeds = given.pop("seeds")
     sizes = PUBLISHED if given.pop("published") else SMALL
     data_prep.check(seeds > 0, "--seeds: use a number from 1")
-    is_plain = not {"resume", "render"} & set(given)
+    is_plain = not (given.pop("resume") or given.pop("render"))
     data_prep.check(is_plain, "an experiment goes on by itself: no --resume, no --render")
     rows = dict(
         chart=chart_rows(given, sizes),
