@@ -1511,8 +1511,9 @@ def execute(cfg, scene, run, saved=None, kind=GeoNVS):
     model, state = train(cfg, scene, run, saved, kind)
     if RANK == 0:
         metrics = finish(model, scene, state, run)
-        numbers = [f"{k} {v:.4g}" for k, v in metrics.items() if isinstance(v, float)]
-        print(" ", "  ".join(numbers))
+        for key, value in metrics.items():
+            if isinstance(value, float):
+                print(f"  {key} {value:.4g}")
         return metrics
 
 
