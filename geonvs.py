@@ -1360,7 +1360,7 @@ def extract_mesh(model):
 
 
 def write_ply(path, vertices, faces):
-    """A PLY file of text; with fewer than nine digits coordinates of a map lose their centimetres."""
+    """A PLY file of text; with fewer than nine digits coordinates of a map lose centimetres."""
     header = f"""ply
 format ascii 1.0
 element vertex {len(vertices)}
