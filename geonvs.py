@@ -1012,16 +1012,12 @@ def open_counter(device):
 
 def metered_joules(device, joules):
     """Yields the joules spent until then, on top of those given; ends once a counter has failed,
-    which ends metering, not the run. A counter that starts again from zero between two readings
-    loses what it counted there."""
+    which ends metering, not the run."""
     try:
         counter = open_counter(device)
-        last = counter()
+        begin = counter()
         while joules is not None:
-            yield joules
-            now = counter()
-            joules += max(0.0, now - last)
-            last = now
+            yield joules + counter() - begin
     except Exception as error:  # a package, a driver's answer or a permission is missing
         print(f"  energy is null ({error}); on a GPU: pip install nvidia-ml-py")
 
