@@ -1399,7 +1399,8 @@ def write_panel(path, model, scene, codes):
 
 
 def finish(model, scene, state, run):
-    """Scores a trained model and writes metrics.json, panel.png and mesh.ply below run."""
+    """Scores a trained model; writes metrics.json, panel.png and mesh.ply below run. Returns the
+    metrics, and prints those that are one number with a fraction."""
     unit = 1 if sys.platform == "darwin" else 1024  # bytes
     peak = unit * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss  # before scoring
     machine = f"cpu, {torch.get_num_threads()} threads"
@@ -1437,6 +1438,9 @@ def finish(model, scene, state, run):
         commit=None if status else commit,
         config=vars(model.cfg))
     atomic_write(run / "metrics.json", lambda part: part.write_text(json.dumps(metrics, indent=1)))
+    for key, value in metrics.items():
+        if isinstance(value, float):
+            print(f"  {key} {value:.4g}")
     return metrics
 
 
@@ -1506,11 +1510,7 @@ def execute(cfg, scene, run, saved=None, kind=GeoNVS):
           f"{len(scene.photos(True))} held out; {scene.c2w.device}; {run}/")
     model, state = train(cfg, scene, run, saved, kind)
     if RANK == 0:
-        metrics = finish(model, scene, state, run)
-        for key, value in metrics.items():
-            if isinstance(value, float):
-                print(f"  {key} {value:.4g}")
-        return metrics
+        return finish(model, scene, state, run)
 
 
 def start_processes(device):
