@@ -193,7 +193,7 @@ def load_scene(raw, device="cpu"):
     static = np.zeros((len(thumbs), n, n), bool)
     static[raw["track_photo"][is_seen], row, col] = True
     arrays = [raw[key] for key in Scene._fields[:8]]
-    arrays += [np.stack(thumbs).transpose(0, 3, 1, 2), static]
+    arrays += [np.moveaxis(thumbs, 3, 1), static]
     tensors = []
     for array in arrays:
         tensor = torch.as_tensor(array, device=device)
