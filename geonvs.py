@@ -177,7 +177,7 @@ class Scene(NamedTuple):
 
     def photos(self, is_test):
         """Numbers (B,) of the held-out photos, or of those to train on."""
-        return torch.nonzero(self.is_test == is_test)[:, 0]
+        return torch.where(self.is_test == is_test)[0]
 
 
 def load_scene(raw, device="cpu"):
