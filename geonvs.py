@@ -364,15 +364,15 @@ class Octree(nn.Module):
         level (P,L); the place in a cell of the level, 0..1 (P,L,3). An x outside the cube is moved
         to its border."""
         place = 0.5 + x * (0.5 / self.half)  # (P,3) over the cube
-        place = place.clamp(0, 1 - 1e-6).nan_to_num(0)  # a diverging run ends at its next log line
+        place = place.clamp(0, 1 - 1e-6).nan_to_num()  # a diverging run ends at its next log line
         place = place[:, None] * self.resolution[:, None]  # (P,L,3) in cells
         index = place.long()  # (P,L,3)
-        octant = number_of(index & 1, 2)  # (P,L)
-        node = number_of(index[:, 0], self.root)  # (P,)
+        octants = number_of(index & 1, 2)  # (P,L)
+        node = number_of(index[:, 0], self.root)  # (P,) of level 0
         nodes = [node]
-        for level in range(1, self.levels):
-            child = self.child.index_select(0, node)  # (P,)
-            node = torch.where(child > 0, child + octant[:, level], node)
+        for octant in octants.T[1:]:  # (P,) of the levels after it
+            child = self.child[node]  # (P,)
+            node = torch.where(child > 0, child + octant, node)
             nodes.append(node)
         return torch.column_stack(nodes), place.frac()
 
