@@ -356,7 +356,7 @@ class Octree(nn.Module):
         key = key[is_whole]  # (V,)
         is_old = torch.isin(key, self.corner_key)
         self.corner_key = key
-        self.features = nn.Parameter(place_rows(self.features.detach(), is_old))
+        self.features = nn.Parameter(place_rows(self.features, is_old))
         return is_old
 
     def locate(self, x):
@@ -512,7 +512,7 @@ class LipschitzLinear(nn.Linear):
     bound in the max norm (Liu et al. 2022, who have softplus for exp)."""
     def __init__(self, inputs, outputs):
         super().__init__(inputs, outputs)
-        self.c = nn.Parameter(self.weight.data.abs().sum(1).max().log())
+        self.c = nn.Parameter(self.weight.abs().sum(1).max().log())
 
     def forward(self, x):
         scale = (self.c.exp() / self.weight.abs().sum(1, keepdim=True)).clamp_max(1)  # (out,1)
