@@ -416,11 +416,11 @@ def seed_octree(octree, points, dense):
 
 def worst_cells(octree):
     """The cells (N,4) that should be split: the worst, with 80 % of the error that is recorded in
-    cells whose children are no finer than a pixel. [D15]"""
+    cells whose children are no finer than a pixel. Rays end in cells that are not split. [D15]"""
     level = octree.cells[:, 0]  # (N,)
     error, pixel, count = octree.record.unbind(1)  # (N,) sums over rays
     is_coarse = pixel < count * octree.side[level] / 2  # mean size of a pixel under a child's side
-    can_split = is_coarse & (octree.child == 0) & (level < octree.levels - 1)
+    can_split = is_coarse & (level < octree.levels - 1)
     found, worst = (error * can_split).sort(descending=True)  # (N,)
     before = found.cumsum(0) - found  # (N,) what worse cells hold
     is_chosen = before < 0.8 * found.sum()

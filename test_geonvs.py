@@ -1491,6 +1491,7 @@ def test_the_worst_cells_that_hold_most_of_the_error_are_chosen(monkeypatch):
     octree = make_tree()
     octree.record.uniform_()
     octree.record[:, 1] /= 4  # pixels of about the sizes of cells
+    octree.record[octree.child > 0] = 0
     candidates = []
     for row, level in enumerate(octree.cells[:, 0].tolist()):
         error, pixel, count = octree.record[row].tolist()
