@@ -546,7 +546,7 @@ def inverse_cdf(edges, weight, u):
     """Positions (R,S) where the linear CDF of weight (R,N) on edges (R,N+1) reaches u (R,S)."""
     cdf = weight.cumsum(1)
     cdf = F.pad(cdf / cdf[:, -1:], (1, 0))  # (R,N+1)
-    right = torch.searchsorted(cdf, u, right=True).clamp(1, weight.shape[1])  # (R,S)
+    right = torch.searchsorted(cdf, u, right=True).clamp_max(weight.shape[1])  # (R,S) from 1
     left = right - 1
     below = cdf.gather(1, left)
     width = cdf.gather(1, right) - below
