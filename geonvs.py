@@ -424,7 +424,7 @@ def worst_cells(octree):
     found, worst = (error * can_split).sort(descending=True)  # (N,)
     before = found.cumsum(0) - found  # (N,) what worse cells hold
     is_chosen = before < 0.8 * found.sum()
-    room = max(0, MAX_CELLS - len(level)) // 8
+    room = (MAX_CELLS - len(level)) // 8  # seeding leaves most of it
     return octree.cells[worst[is_chosen][:room]]
 
 
