@@ -567,8 +567,7 @@ class SDFCache(nn.Module):
 
     def refresh(self, sdf):
         """Evaluates sdf, (P,3) to (P,), again."""
-        s = in_chunks(sdf, self.points)  # (P,)
-        self.volume.copy_(s.view_as(self.volume))
+        self.volume.view(-1)[:] = in_chunks(sdf, self.points)  # (P,)
 
     def sdf(self, x):
         """s (R,N) at x (R,N,3), trilinear."""
