@@ -625,10 +625,9 @@ class Background(nn.Module):
         sigma = F.softplus(density.reshape_as(jitter) - 1)  # (R,S)
         alpha = 1 - torch.exp(-sigma[:, :-1] * path.diff())  # (R,S-1)
         w = composite(F.pad(alpha, (0, 1), value=1.0))  # (R,S)
-        colors = w[:, :, None] * rgb
-        front, behind = colors.split([n, S - n], 1)
-        passes = 1 - w[:, :n].sum(1, keepdim=True)
-        return front.sum(1), passes, behind.sum(1)
+        passes = 1 - w[:, :n].sum(1, keepdim=True)  # (R,1)
+        colors = w[:, :, None] * rgb  # (R,S,3)
+        return colors[:, :n].sum(1), passes, colors[:, n:].sum(1)
 
 
 def render_rays(model, rays, code, jitter):
