@@ -496,9 +496,8 @@ class SDFField(nn.Module):
         """sdf (P,) and geometry (P,G) at x (P,3)."""
         feat = self.octree(x)  # (P,LC)
         out = self.network(torch.hstack([x, feat]))  # (P,1+GEO)
-        change, geo = out.split([1, GEO], 1)
-        sdf = x.norm(dim=1) - 0.25 + change[:, 0]  # (P,)
-        return sdf, torch.hstack([geo, feat])
+        sdf = x.norm(dim=1) - 0.25 + out[:, 0]  # (P,)
+        return sdf, torch.hstack([out[:, 1:], feat])
 
     def derivatives(self, x, eps):
         """grad s (P,3) and lap s (P,) at x (P,3), from s there and at four taps, eps away."""
