@@ -377,14 +377,15 @@ class Octree(nn.Module):
         return torch.column_stack(nodes), place.frac()
 
     def forward(self, x):
-        """Features (P,LC) at x (P,3)."""
-        node, place = self.locate(x)
+        """Features (...,LC) at x (...,3)."""
+        node, place = self.locate(x.flatten(0, -2))  # of P points
         exists = F.pad(node.diff() > 0, (1, 0), value=True)  # (P,L) or a coarser cell's
         node = node.flatten()  # (PL,)
         w = corner_weights(place.flatten(0, 1))  # (PL,8)
         w = w * self.is_free.index_select(0, node) * exists.reshape(-1, 1)
         corner = self.corner.index_select(0, node)  # (PL,8)
-        return WeightedSum.apply(self.features, corner, w).reshape(len(x), self.width)
+        feat = WeightedSum.apply(self.features, corner, w)  # (PL,C)
+        return feat.reshape(*x.shape[:-1], self.width)
 
 
 def place_rows(table, is_old):
@@ -451,11 +452,11 @@ def mlp(inputs, hidden, outputs):
 
 
 def colors_of(network, geo, per_ray):
-    """Colours (R,S,3) that a network reads from geometry (RS,G) and what is the same for all
+    """Colours (R,S,3) that a network reads from geometry (R,S,G) and what is the same for all
     samples of a ray (R,.)."""
-    R = len(per_ray)
-    inputs = torch.hstack([geo, per_ray.repeat_interleave(len(geo) // R, 0)])
-    return mixed_precision(network, inputs).sigmoid().reshape(R, -1, 3)
+    per_ray = per_ray[:, None].expand(-1, geo.shape[1], -1)  # (R,S,.)
+    inputs = torch.cat([geo, per_ray], 2)
+    return mixed_precision(network, inputs).sigmoid()
 
 
 UNIT = 3**-0.5
@@ -493,17 +494,17 @@ class SDFField(nn.Module):
         self.taps = torch.tensor(TAPS)  # (5,3)
 
     def forward(self, x):
-        """sdf (P,) and geometry (P,G) at x (P,3)."""
-        feat = self.octree(x)  # (P,LC)
-        out = self.network(torch.hstack([x, feat]))  # (P,1+GEO)
-        sdf = x.norm(dim=1) - 0.25 + out[:, 0]  # (P,)
-        return sdf, torch.hstack([out[:, 1:], feat])
+        """sdf (...) and geometry (...,G) at x (...,3)."""
+        feat = self.octree(x)  # (...,LC)
+        out = self.network(torch.cat([x, feat], -1))  # (...,1+GEO)
+        sdf = x.norm(dim=-1) - 0.25 + out[..., 0]  # (...)
+        return sdf, torch.cat([out[..., 1:], feat], -1)
 
     def derivatives(self, x, eps):
         """grad s (P,3) and lap s (P,) at x (P,3), from s there and at four taps, eps away."""
         points = x[:, None] + eps * self.taps  # (P,5,3)
-        sdf, _ = self(points.flatten(0, 1))
-        return finite_differences(sdf.reshape(-1, 5), self.taps, eps)
+        sdf, _ = self(points)  # (P,5)
+        return finite_differences(sdf, self.taps, eps)
 
 
 class LipschitzLinear(nn.Linear):
@@ -617,11 +618,11 @@ class Background(nn.Module):
         beyond = u / (1 - u).clamp_min(1e-3)
         path = torch.hstack([before, t0 + beyond])  # (R,S) without the sphere, for lengths
         t = torch.hstack([before, t1 + beyond])  # (R,S)
-        x = contract(rays.at(t)).flatten(0, 1)  # (RS,3)
-        inputs = torch.hstack([x, self.octree(x)])  # (RS,3+LC)
-        density, geo = mixed_precision(self.density, inputs).split([1, GEO], 1)
+        x = contract(rays.at(t))  # (R,S,3)
+        inputs = torch.cat([x, self.octree(x)], 2)  # (R,S,3+LC)
+        density, geo = mixed_precision(self.density, inputs).split([1, GEO], 2)
         rgb = colors_of(self.color, geo, per_ray)  # (R,S,3)
-        sigma = F.softplus(density.reshape_as(jitter) - 1)  # (R,S)
+        sigma = F.softplus(density.squeeze(2) - 1)  # (R,S)
         alpha = 1 - torch.exp(-sigma[:, :-1] * path.diff())  # (R,S-1)
         w = composite(F.pad(alpha, (0, 1), value=1.0))  # (R,S)
         passes = 1 - w[:, :n].sum(1, keepdim=True)  # (R,1)
@@ -638,8 +639,8 @@ def render_rays(model, rays, code, jitter):
     inner, outer = jitter.tensor_split([model.cfg.samples - 1], 1)
     t0, t1 = sphere_interval(rays)  # (R,1)
     t = model.cache.distances(rays, t0, t1, inner, zeta)  # (R,S+1)
-    sdf, geo = model.sdf(rays.at(t).flatten(0, 1))  # (R(S+1),), (R(S+1),G)
-    w = composite(neus_alpha(sdf.reshape(t.shape), zeta))  # (R,S)
+    sdf, geo = model.sdf(rays.at(t))  # (R,S+1), (R,S+1,G)
+    w = composite(neus_alpha(sdf, zeta))  # (R,S)
     trans = 1 - w.sum(1)  # (R,) what passes all of them
     w = F.avg_pool1d(w, 2, stride=1, padding=1)  # (R,S+1) mean of the sections beside a sample [D2]
 

@@ -2463,7 +2463,8 @@ def test_without_codes_nothing_is_fitted(scene):
 def knowing(warm):
     """A model that knows the toy: its surface and people, and the right halves of photos."""
     def forward(x):
-        return torch.as_tensor(scene_sdf(toy(), x.numpy())).float(), None
+        s = scene_sdf(toy(), x.reshape(-1, 3).numpy())
+        return torch.as_tensor(s).float().reshape(x.shape[:-1]), None
 
     def render(rays, code):
         is_right = rays.uv[:, :1] > 0.48
@@ -3279,7 +3280,7 @@ class NoNormal(geonvs.GeoNVS):
     def hide_normal(self, _, inputs):
         x = inputs[0].clone()
         begin = geonvs.GEO + self.sdf.octree.width
-        x[:, begin:begin + 3] = 0
+        x[..., begin:begin + 3] = 0
         return x
 
 
