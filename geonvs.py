@@ -678,23 +678,21 @@ def conv(inputs, outputs, stride):
 
 
 class ContextBlock(nn.Module):
-    """Context-guided block (CGNet Fig. 3) at half the resolution: local and dilated context, gated
-    globally; no residual, no 1x1. [D6]"""
-    def __init__(self, inputs, outputs, dilation):
+    """Context-guided block (CGNet Fig. 3), from n channels to 2n at half the resolution: local and
+    dilated context, gated globally; no residual, no 1x1. [D6]"""
+    def __init__(self, n, dilation):
         super().__init__()
-        half = outputs // 2
-        self.reduce = conv(inputs, half, stride=2)
-        self.local = nn.Conv2d(half, half, 3, padding=1, groups=half)
-        self.around = nn.Conv2d(
-            half, half, 3, padding=dilation, dilation=dilation, groups=half)
-        self.norm = nn.GroupNorm(8, outputs)
-        self.gate = mlp(outputs, outputs // 8, outputs)
+        self.reduce = conv(n, n, stride=2)
+        self.local = nn.Conv2d(n, n, 3, padding=1, groups=n)
+        self.around = nn.Conv2d(n, n, 3, padding=dilation, dilation=dilation, groups=n)
+        self.norm = nn.GroupNorm(8, 2 * n)
+        self.gate = mlp(2 * n, n // 4, 2 * n)
 
     def forward(self, x):
-        y = self.reduce(x)  # (B,outputs/2,h/2,w/2)
-        y = torch.cat([self.local(y), self.around(y)], 1)
-        y = F.relu(self.norm(y))  # (B,outputs,h/2,w/2)
-        gate = self.gate(y.mean((2, 3))).sigmoid()  # (B,outputs)
+        y = self.reduce(x)  # (B,n,h/2,w/2)
+        y = torch.hstack([self.local(y), self.around(y)])
+        y = F.relu(self.norm(y))  # (B,2n,h/2,w/2)
+        gate = self.gate(y.mean((2, 3))).sigmoid()  # (B,2n)
         return y * gate[:, :, None, None]
 
 
@@ -705,8 +703,8 @@ class CGNet(nn.Module):
         super().__init__()
         self.stages = nn.Sequential(
             nn.Sequential(conv(3, 16, stride=2), conv(16, 16, stride=1)),
-            ContextBlock(16, 32, dilation=2),
-            ContextBlock(32, 64, dilation=4))
+            ContextBlock(16, dilation=2),
+            ContextBlock(32, dilation=4))
         self.heads = nn.Sequential(*[nn.Conv2d(n, 1, 1, bias=n == 16) for n in (16, 32, 64)])
         nn.init.constant_(self.heads[0].bias, -2.5)  # starts with 8 % masked, not with half
 
