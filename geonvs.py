@@ -705,7 +705,7 @@ class CGNet(nn.Module):
             nn.Sequential(conv(3, 16, stride=2), conv(16, 16, stride=1)),
             ContextBlock(16, dilation=2),
             ContextBlock(32, dilation=4))
-        self.heads = nn.Sequential(*[nn.Conv2d(n, 1, 1, bias=n == 16) for n in (16, 32, 64)])
+        self.heads = nn.ModuleList(nn.Conv2d(n, 1, 1, bias=n == 16) for n in (16, 32, 64))
         nn.init.constant_(self.heads[0].bias, -2.5)  # starts with 8 % masked, not with half
 
     def forward(self, photo):
@@ -714,7 +714,7 @@ class CGNet(nn.Module):
         logits = 0
         for stage, head in zip(self.stages, self.heads):
             y = stage(y)  # (B,16,H/2,W/2), (B,32,H/4,W/4), (B,64,H/8,W/8)
-            logits = logits + F.interpolate(head(y), size, mode="bilinear")
+            logits += F.interpolate(head(y), size, mode="bilinear")
         return logits  # (B,1,H/2,W/2)
 
 
