@@ -696,28 +696,6 @@ class ContextBlock(nn.Module):
         return y * gate[:, :, None, None]
 
 
-class CGNet(nn.Module):
-    """Whole photos (B,3,H,W) in 0..1 to transient logits (B,1,H/2,W/2) (CGNet, as in CR-NeRF). [D6]
-    The head reads all three resolutions: at 1/8 alone a mask could not follow an outline."""
-    def __init__(self):
-        super().__init__()
-        self.stages = nn.Sequential(
-            nn.Sequential(conv(3, 16, stride=2), conv(16, 16, stride=1)),
-            ContextBlock(16, dilation=2),
-            ContextBlock(32, dilation=4))
-        self.heads = nn.ModuleList(nn.Conv2d(n, 1, 1, bias=n == 16) for n in (16, 32, 64))
-        nn.init.constant_(self.heads[0].bias, -2.5)  # starts with 8 % masked, not with half
-
-    def forward(self, photo):
-        size = [(n + 1) // 2 for n in photo.shape[2:]]
-        y = photo - 0.5
-        logits = 0
-        for stage, head in zip(self.stages, self.heads):
-            y = stage(y)  # (B,16,H/2,W/2), (B,32,H/4,W/4), (B,64,H/8,W/8)
-            logits += F.interpolate(head(y), size, mode="bilinear")
-        return logits  # (B,1,H/2,W/2)
-
-
 def sample_logits(logits, uv):
     """Logits (R,) at uv (R,2) in 0..1 of logits (B,1,h,w); rays come photo by photo, R / B each."""
     grid = (2 * uv - 1).reshape(len(logits), -1, 1, 2)  # (B,R/B,1,2)
@@ -770,10 +748,17 @@ def follow_quantiles(running, shares, values, is_chosen):
     running *= torch.exp(0.1 * excess)
 
 
-class TransientMask(CGNet):
-    """CGNet on small photos, which gives M, and the running quantiles that prices depend on."""
+class TransientMask(nn.Module):
+    """CGNet (as in CR-NeRF), which gives M, and the running quantiles that prices depend on. The
+    head reads all three resolutions: at 1/8 alone a mask could not follow an outline. [D6]"""
     def __init__(self, scene):
         super().__init__()
+        self.stages = nn.Sequential(
+            nn.Sequential(conv(3, 16, stride=2), conv(16, 16, stride=1)),
+            ContextBlock(16, dilation=2),
+            ContextBlock(32, dilation=4))
+        self.heads = nn.ModuleList(nn.Conv2d(n, 1, 1, bias=n == 16) for n in (16, 32, 64))
+        nn.init.constant_(self.heads[0].bias, -2.5)  # starts with 8 % masked, not with half
         self.thumbs = scene.thumbs
         self.static = scene.static
         self.shares = torch.tensor([0.5, 0.75, 0.95])
@@ -781,8 +766,14 @@ class TransientMask(CGNet):
         self.sfm_error = nn.Buffer(torch.tensor([0.3]))  # (1,) upper quartile at SfM pixels
 
     def logits(self, photos):
-        """Logits (B,1,n/2,n/2) of photos (B,)."""
-        return self(self.thumbs[photos] / 255)
+        """Transient logits (B,1,n/2,n/2) of photos (B,)."""
+        y = self.thumbs[photos] / 255 - 0.5  # (B,3,n,n)
+        size = (y.shape[2] + 1) // 2
+        logits = 0
+        for stage, head in zip(self.stages, self.heads):
+            y = stage(y)  # (B,16,n/2,n/2), (B,32,n/4,n/4), (B,64,n/8,n/8)
+            logits += F.interpolate(head(y), size, mode="bilinear")
+        return logits
 
     def is_static(self, rays):
         """Which rays (R,) go through pixels that show SfM points."""
