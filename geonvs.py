@@ -708,12 +708,6 @@ def complexity(e_grad, e_curv):
     return 10.0 * e_grad + 2.0 * e_curv
 
 
-def edge_indicator(richness, centre=0.0, width=1.0):
-    """The sigmoid of Eq. 4, of a ray's complexity (R,). Its centre and width are calibrated [D3]:
-    with 0 and 1 it is at least 0.5 on every ray."""
-    return torch.sigmoid((richness - centre) / width)
-
-
 def gpl_loss(mask, phi):
     """Geometry-preservation loss: mean of M(r) Phi(r). Eq. 3. It is logged; it acts through the
     price of a ray, weight included [D7]."""
@@ -781,11 +775,12 @@ class TransientMask(nn.Module):
         return self.static[rays.img, row, col]
 
     def phi(self, richness, opacity):
-        """Phi (R,), Eq. 4: opacity times the sigmoid, which is 0.5 at the upper quartile of rays
-        that end on the foreground. richness: their complexity. [D3]"""
+        """Phi (R,), Eq. 4: opacity times a sigmoid of the complexity `richness` (R,), which is 0.5
+        at the upper quartile of rays that end on the foreground. A plain sigmoid is at least 0.5 on
+        every ray. [D3]"""
         p50, p75, p95 = self.richness
         width = ((p95 - p50) / 4).clamp_min(1e-3)
-        return opacity * edge_indicator(richness, p75, width)
+        return opacity * torch.sigmoid((richness - p75) / width)
 
     def price(self, phi, cfg):
         """The error (R,) above which a ray is transient. [D7]"""

@@ -3232,7 +3232,7 @@ class FlatPhi(geonvs.TransientMask):
 class LiteralPhi(geonvs.TransientMask):
     """Phi with a sigmoid as it stands in Eq. 4, neither calibrated nor faded: above 0.5 always."""
     def phi(self, richness, opacity):
-        return geonvs.edge_indicator(richness)
+        return torch.sigmoid(richness)
 
 
 class PrintedPrice(geonvs.TransientMask):
