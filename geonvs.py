@@ -714,12 +714,12 @@ def gpl_loss(mask, phi):
     return (mask * phi).mean()
 
 
-def transient_loss(logit, error, price):
-    """Teaches M = 1 to rays whose error (R,) exceeds their price (R,), M = 0 to the others. The
-    same M minimises (1 - M) error + M price, but the slope of that vanishes where the sigmoid is
-    flat. [D7]"""
-    is_transient = (error > price).float()
-    return F.binary_cross_entropy_with_logits(logit, is_transient, (error - price).abs())
+def transient_loss(logit, excess):
+    """Teaches M = 1 to rays whose error exceeds their price by excess (R,), M = 0 to those where it
+    is negative. The same M minimises (1 - M) error + M price, but the slope of that vanishes where
+    the sigmoid is flat. [D7]"""
+    is_transient = (excess > 0).float()
+    return F.binary_cross_entropy_with_logits(logit, is_transient, excess.abs())
 
 
 TAUGHT = 0.6  # share of training in which the mask learns [D7]; longer, it would give people up
@@ -874,11 +874,11 @@ class GeoNVS(nn.Module):
         if cfg.mask != "off":
             logit = sample_logits(self.mask.logits(photos), rays.uv)  # (R,)
             mask = logit.detach().sigmoid()
-            price = self.mask.price(phi, cfg)
             dynamic = error * ~is_static  # (R,) SfM pixels: M = 0 [D10]
+            excess = dynamic - self.mask.price(phi, cfg)  # (R,)
             if done < TAUGHT:
-                l_mask = transient_loss(logit, dynamic, price)
-            mask = reject_outliers(mask, dynamic > price, done)
+                l_mask = transient_loss(logit, excess)
+            mask = reject_outliers(mask, excess > 0, done)
 
         which = random_index(gen, cfg.samples + 1, R)
         t = out["t"].gather(1, which[:, None])  # (R,1)

@@ -3241,11 +3241,11 @@ class PrintedPrice(geonvs.TransientMask):
         return cfg.lam_gpl * phi
 
 
-def printed_mask_loss(logit, error, price):
-    """(1 - M) error + 0.15 M^2 + lam_gpl M Phi: the terms of Eq. 5 that hold M, with the mean of
-    M^2 for L_reg, as in Ha-NeRF."""
+def printed_mask_loss(logit, excess):
+    """0.15 M^2 - M (error - lam_gpl Phi): the terms of Eq. 5 that hold M, with the mean of M^2 for
+    L_reg, as in Ha-NeRF."""
     mask = logit.sigmoid()
-    return ((1 - mask) * error + 0.15 * mask**2 + price * mask).mean()
+    return (0.15 * mask**2 - excess * mask).mean()
 
 
 def keep_outliers(mask, is_outlier, done):
