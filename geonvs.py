@@ -209,6 +209,7 @@ class Rays(NamedTuple):
     img: Tensor  # (R,) photo index
     uv: Tensor  # (R,2) pixel position over photo size, 0..1
     rgb: Tensor  # (R,3) the photo's colour
+    is_static: Tensor  # (R,) whether the mask's pixel shows an SfM point [D10]
 
     def at(self, t):
         """Points (R,S,3) at distances t (R,S)."""
@@ -226,7 +227,10 @@ def make_rays(scene, img, pixel):
     d = F.normalize(F.pad(d, (0, 1), value=1.0))  # (R,3) in camera axes
     d = torch.einsum("rij,rj->ri", c2w[:, :, :3], d)  # (R,3) in world axes
     rgb = scene.rgb[scene.start[img] + pixel] / 255
-    return Rays(c2w[:, :, 3], d, scene.near[img, None], img, xy / wh, rgb)
+    uv = xy / wh  # (R,2)
+    col, row = (uv * scene.static.shape[1]).long().unbind(1)  # (R,) of the mask's pixel
+    is_static = scene.static[img, row, col]
+    return Rays(c2w[:, :, 3], d, scene.near[img, None], img, uv, rgb, is_static)
 
 
 def uniform(gen, *shape):
@@ -754,7 +758,6 @@ class TransientMask(nn.Module):
         self.heads = nn.ModuleList(nn.Conv2d(n, 1, 1, bias=n == 16) for n in (16, 32, 64))
         nn.init.constant_(self.heads[0].bias, -2.5)  # starts with 8 % masked, not with half
         self.thumbs = scene.thumbs
-        self.static = scene.static
         self.shares = torch.tensor([0.5, 0.75, 0.95])
         self.richness = nn.Buffer(torch.tensor([0.5, 1.0, 4.0]))  # (3,) of foreground rays
         self.sfm_error = nn.Buffer(torch.tensor([0.3]))  # (1,) upper quartile at SfM pixels
@@ -768,11 +771,6 @@ class TransientMask(nn.Module):
             y = stage(y)  # (B,16,n/2,n/2), (B,32,n/4,n/4), (B,64,n/8,n/8)
             logits += F.interpolate(head(y), size, mode="bilinear")
         return logits
-
-    def is_static(self, rays):
-        """Which rays (R,) go through pixels that show SfM points."""
-        col, row = (rays.uv * self.static.shape[1]).long().unbind(1)
-        return self.static[rays.img, row, col]
 
     def phi(self, richness, opacity):
         """Phi (R,), Eq. 4: opacity times a sigmoid of the complexity `richness` (R,), which is 0.5
@@ -866,7 +864,6 @@ class GeoNVS(nn.Module):
         residual = (out["rgb"] - rays.rgb).abs()  # (R,3)
 
         error = residual.detach().amax(1)  # (R,) of the worst channel
-        is_static = self.mask.is_static(rays)  # (R,)
         richness = complexity(out["e_grad"], out["e_curv"])  # (R,)
         phi = self.mask.phi(richness, out["opacity"]).detach()  # (R,)
         mask = torch.zeros_like(error)
@@ -874,7 +871,7 @@ class GeoNVS(nn.Module):
         if cfg.mask != "off":
             logit = sample_logits(self.mask.logits(photos), rays.uv)  # (R,)
             mask = logit.detach().sigmoid()
-            dynamic = error * ~is_static  # (R,) SfM pixels: M = 0 [D10]
+            dynamic = error * ~rays.is_static  # (R,) SfM pixels: M = 0 [D10]
             excess = dynamic - self.mask.price(phi, cfg)  # (R,)
             if done < TAUGHT:
                 l_mask = transient_loss(logit, excess)
@@ -903,7 +900,7 @@ class GeoNVS(nn.Module):
             + cfg.lam_lps * terms["lps"]
             + cfg.lam_sfm * terms["sfm"]  # [D10]
             + l_mask)  # lam_mask L_reg + lam_gpl L_GPL, by way of its price [D7]
-        out |= dict(error=error, mask=mask, is_static=is_static, richness=richness)
+        out |= dict(error=error, mask=mask, richness=richness)
         return total, terms, out
 
     def before_step(self, step, done):
@@ -922,7 +919,7 @@ class GeoNVS(nn.Module):
         mask = self.mask
         is_solid = out["opacity"] > 0.5  # (R,)
         follow_quantiles(mask.richness, mask.shares, out["richness"], is_solid)
-        follow_quantiles(mask.sfm_error, 0.75, out["error"], out["is_static"])
+        follow_quantiles(mask.sfm_error, 0.75, out["error"], rays.is_static)
         pixel = out["depth"] / self.scene.K[rays.img, 0]  # (R,) its size at the ray's end
         error = (1 - out["mask"]) * out["error"]
         columns = torch.column_stack([error * is_solid, pixel * is_solid, is_solid])  # (R,3)

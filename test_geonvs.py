@@ -131,7 +131,7 @@ def make_batch(model, n=64):
 def fake_rays(o, d):
     """Rays of no photo from o (R,3) along d (R,3)."""
     near = torch.full((len(o), 1), 0.1)
-    return geonvs.Rays(o, F.normalize(d), near, None, None, None)
+    return geonvs.Rays(o, F.normalize(d), near, None, None, None, None)
 
 
 def gradients(model, value):
@@ -1665,6 +1665,7 @@ def rough_case(**changes):
     """A model in float64, with rough features and bounds that bind; eight rays towards its middle,
     but the first misses the sphere, the second starts in it; their photos."""
     scene = geonvs.load_scene(toy() | dict(bg_color=np.array([0.2, 0.4, 0.6])))
+    scene.static.bernoulli_(0.5)
     for name in ("c2w", "near", "points"):
         scene = scene._replace(**{name: getattr(scene, name).double()})
     model = make_model(scene, samples=5, **changes)
@@ -1702,12 +1703,12 @@ def test_a_mask_is_half_as_large_as_its_photo_and_starts_low(warm):
     assert 0.02 < logits.sigmoid().mean() < 0.2
 
 
-def test_pixels_that_show_sfm_points_are_static(warm, scene):
+def test_pixels_that_show_sfm_points_are_static(scene):
     wanted = torch.zeros(len(scene.wh), 32, 32, dtype=torch.bool)
     for photo, (u, v) in zip(scene.raw["track_photo"], scene.raw["track_uv"]):
         if 0 <= u < 1 and 0 <= v < 1:
             wanted[photo, int(v * 32), int(u * 32)] = True
-    assert torch.equal(warm.mask.static, wanted)
+    assert torch.equal(scene.static, wanted)
 
 
 @pytest.mark.parametrize("done, least", [(0.0, 0.0), (0.15, 0.25), (0.3, 1.0)])
@@ -1726,11 +1727,11 @@ def test_phi_has_a_width_if_all_quantiles_are_alike(warm):
 def test_observing_follows_quantiles_and_records_where_foreground_rays_end(warm):
     rays, _ = make_batch(warm, 1000)
     index = torch.arange(1000)
+    rays = rays._replace(is_static=index % 2 == 0)
     out = dict(  # 40 of 1,000 rays end on the foreground
         opacity=torch.where(index < 40, 0.9, 0.1),
         richness=torch.where(index < 40, random(1000), 50.0),
         error=random(1000),
-        is_static=index % 2 == 0,
         depth=2 + random(1000),
         mask=random(1000),
         end=random(1000, 3, low=-0.9, high=0.9))
@@ -1780,7 +1781,7 @@ def plain_losses(model, rays, done):
             M = logit.sigmoid().item()
             col, row = (rays.uv[r] * 32).long()
             excess = -price - cfg.lam_gpl * phi
-            if not model.mask.static[photo, row, col]:
+            if not model.scene.static[photo, row, col]:
                 excess += residual.max().item()
             if done < 0.6:
                 right = logit if excess > 0 else -logit
@@ -1812,7 +1813,6 @@ def test_the_objective_and_its_gradients_equal_plain_loops(
     model.v.data.fill_(math.log(zeta) / 10)
     model.mask.richness.copy_(torch.tensor([1.0, 6, 20]))
     model.mask.sfm_error.fill_(sfm_error)
-    model.mask.static.bernoulli_(0.5)
     total, terms, _ = model.losses(rays, photos, done, generator())
     plain = plain_losses(model, rays, done)
     for name, value in terms.items():
