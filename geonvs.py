@@ -805,6 +805,7 @@ class GeoNVS(nn.Module):
         # learning rates of networks; of octree features, codes and the mask, which learn faster
         self.rates = (cfg.lr_net, cfg.lr_grid, cfg.lr_code, 8e-3)
         raw = scene.raw
+        hidden = cfg.hidden
         levels = cfg.levels
         if levels == 0:  # no cell smaller than a pixel [D15]
             pixels = 2 / raw["footprint"]  # across the sphere; footprint: a pixel's size there
@@ -815,13 +816,13 @@ class GeoNVS(nn.Module):
         self.sfm = scene.points[is_inside]  # (N,3), never empty: data_prep places the sphere so
         octree = Octree(1.0, levels)
         seed_octree(octree, self.sfm, dense=0)
-        self.sdf = SDFField(octree, cfg.hidden)
+        self.sdf = SDFField(octree, hidden)
         self.color = nn.Sequential(
-            LipschitzLinear(GEO + octree.width + 3 + 3 + A, cfg.hidden),
+            LipschitzLinear(GEO + octree.width + 3 + 3 + A, hidden),
             nn.ReLU(),
-            LipschitzLinear(cfg.hidden, cfg.hidden),
+            LipschitzLinear(hidden, hidden),
             nn.ReLU(),
-            LipschitzLinear(cfg.hidden, 3))
+            LipschitzLinear(hidden, 3))
         self.appearance = nn.Embedding(len(scene.wh), A)
         self.appearance.requires_grad_(A > 0)
         nn.init.normal_(self.appearance.weight, std=0.01)
@@ -831,7 +832,7 @@ class GeoNVS(nn.Module):
         self.bg_color = torch.tensor(raw["bg_color"].tolist()).nan_to_num(0.5)
         if is_on(cfg.background, np.isnan(raw["bg_color"]).any()):  # nan: there is no one colour
             self.background = Background(
-                scene.points[~is_inside], cfg.hidden, 3 + A, min(levels, 4))
+                scene.points[~is_inside], hidden, 3 + A, min(levels, 4))
             self.octrees.append(self.background.octree)
         self.v = nn.Parameter(torch.tensor(math.log(20) / 10))
         self.mask = TransientMask(scene)
