@@ -804,6 +804,7 @@ class GeoNVS(nn.Module):
         self.scene = scene
         # learning rates of networks; of octree features, codes and the mask, which learn faster
         self.rates = (cfg.lr_net, cfg.lr_grid, cfg.lr_code, 8e-3)
+        self.draws = cfg.samples - 1 + cfg.bg_samples  # random numbers that place a ray's samples
         raw = scene.raw
         hidden = cfg.hidden
         levels = cfg.levels
@@ -860,7 +861,7 @@ class GeoNVS(nn.Module):
         cfg = self.cfg
         R = len(rays.o)
         code = self.appearance(photos).repeat_interleave(R // len(photos), 0)  # (R,A)
-        jitter = uniform(gen, R, cfg.samples - 1 + cfg.bg_samples)
+        jitter = uniform(gen, R, self.draws)
         out = render_rays(self, rays, code, jitter)
         residual = (out["rgb"] - rays.rgb).abs()  # (R,3)
 
@@ -971,8 +972,7 @@ class GeoNVS(nn.Module):
 
     def render(self, rays, code):
         """render_rays without jitter, for pictures and for fitting codes."""
-        draws = self.cfg.samples - 1 + self.cfg.bg_samples
-        return render_rays(self, rays, code, code.new_full((len(code), draws), 0.5))
+        return render_rays(self, rays, code, code.new_full((len(code), self.draws), 0.5))
 
 
 # ---- 8 Energy ------------------------------------------------------------------------------------
