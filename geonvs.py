@@ -213,7 +213,7 @@ class Rays(NamedTuple):
 
     def at(self, t):
         """Points (R,S,3) at distances t (R,S)."""
-        return torch.addcmul(self.o[:, None], t[:, :, None], self.d[:, None])
+        return torch.addcmul(self.o[:, None], t[..., None], self.d[:, None])
 
 
 def make_rays(scene, img, pixel):
@@ -225,12 +225,12 @@ def make_rays(scene, img, pixel):
     xy = torch.column_stack([pixel % w, pixel // w]) + 0.5  # (R,2) px
     d = (xy - centre) / focal  # (R,2)
     d = F.normalize(F.pad(d, (0, 1), value=1.0))  # (R,3) in camera axes
-    d = torch.einsum("rij,rj->ri", c2w[:, :, :3], d)  # (R,3) in world axes
+    d = torch.einsum("rij,rj->ri", c2w[..., :3], d)  # (R,3) in world axes
     rgb = scene.rgb[scene.start[img] + pixel] / 255
     uv = xy / wh  # (R,2)
     col, row = (uv * scene.static.shape[1]).long().unbind(1)  # (R,) of the mask's pixel
     is_static = scene.static[img, row, col]
-    return Rays(c2w[:, :, 3], d, scene.near[img, None], img, uv, rgb, is_static)
+    return Rays(c2w[..., 3], d, scene.near[img, None], img, uv, rgb, is_static)
 
 
 def uniform(gen, *shape):
@@ -285,7 +285,7 @@ class WeightedSum(torch.autograd.Function):
     @staticmethod
     def backward(ctx, grad):  # (P,C)
         table, row, w = ctx.saved_tensors
-        share = w[:, :, None] * grad[:, None]  # (P,8,C)
+        share = w[..., None] * grad[:, None]  # (P,8,C)
         out = torch.zeros_like(table)  # (V,C)
         out.index_add_(0, row.flatten().long(), share.flatten(0, 1))
         return out, None, None
@@ -630,7 +630,7 @@ class Background(nn.Module):
         alpha = 1 - torch.exp(-sigma[:, :-1] * path.diff())  # (R,S-1)
         w = composite(F.pad(alpha, (0, 1), value=1.0))  # (R,S)
         passes = 1 - w[:, :n].sum(1, keepdim=True)  # (R,1)
-        colors = w[:, :, None] * rgb  # (R,S,3)
+        colors = w[..., None] * rgb  # (R,S,3)
         return colors[:, :n].sum(1), passes, colors[:, n:].sum(1)
 
 
@@ -697,7 +697,7 @@ class ContextBlock(nn.Module):
         y = torch.hstack([self.local(y), self.around(y)])
         y = F.relu(self.norm(y))  # (B,2n,h/2,w/2)
         gate = self.gate(y.mean((2, 3))).sigmoid()  # (B,2n)
-        return y * gate[:, :, None, None]
+        return y * gate[..., None, None]
 
 
 def sample_logits(logits, uv):
