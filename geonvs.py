@@ -228,7 +228,7 @@ def make_rays(scene, img, pixel):
     d = torch.einsum("rij,rj->ri", c2w[..., :3], d)  # (R,3) in world axes
     rgb = scene.rgb[scene.start[img] + pixel] / 255
     uv = xy / wh  # (R,2)
-    col, row = (uv * scene.static.shape[1]).long().unbind(1)  # (R,) of the mask's pixel
+    col, row = (uv * scene.static.shape[1]).long().T  # (R,) of the mask's pixel
     is_static = scene.static[img, row, col]
     return Rays(c2w[..., 3], d, scene.near[img, None], img, uv, rgb, is_static)
 
@@ -245,7 +245,7 @@ def random_index(gen, n, count):
 
 def random_rays(scene, img, gen, part=1.0):
     """Rays through random pixels of the photos img (R,), of the left `part` of each."""
-    w, h = scene.wh[img].unbind(1)
+    w, h = scene.wh[img].T
     u, v = uniform(gen, 2, len(img))
     col = (u * (part * w).long()).long()
     return make_rays(scene, img, (v * h).long() * w + col)
@@ -423,7 +423,7 @@ def worst_cells(octree):
     """The cells (N,4) that should be split: the worst, with 80 % of the error that is recorded in
     cells whose children are no finer than a pixel. Rays end in cells that are not split. [D15]"""
     level = octree.cells[:, 0]  # (N,)
-    error, pixel, count = octree.record.unbind(1)  # (N,) sums over rays
+    error, pixel, count = octree.record.T  # (N,) sums over rays
     is_coarse = pixel < count * octree.side[level] / 2  # mean size of a pixel under a child's side
     can_split = is_coarse & (level < octree.levels - 1)
     found, worst = (error * can_split).sort(descending=True)  # (N,)
