@@ -317,8 +317,8 @@ class Octree(nn.Module):
         self.levels = levels
         self.width = levels * channels  # LC
         self.root = root
-        self.features = nn.Parameter(torch.zeros(0, channels))  # (V,C)
-        self.corner_key = torch.arange(0)  # (V,) sorted; the corner of each row, none at first
+        self.features = torch.zeros(0, channels)  # (V,C), none at first; build adds parameters
+        self.corner_key = torch.arange(0)  # (V,) sorted, the corner of each row
         self.resolution = root * 2.0 ** torch.arange(levels)  # (L,) cells along an axis
         self.side = 2 * half / self.resolution  # (L,) of a cell, scene units
         self.build(self.corner_key)  # no cell is split
