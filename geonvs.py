@@ -436,14 +436,14 @@ def worst_cells(octree):
 # ---- 4 Fields: the networks on top of the octree -------------------------------------------------
 
 GEO = 15  # length of the geometry feature that the SDF network hands to the colour network
-MIXED_ON = {"cuda"}  # devices whose colour and background networks run in bfloat16 [D9]
+MIXED_ON = "cuda"  # where colour and background networks run in bfloat16 [D9]
 
 
 def mixed_precision(network, x):
     """network(x), computed in bfloat16 where that pays, returned as float32. [D9]"""
-    if x.device.type not in MIXED_ON:
+    if x.device.type != MIXED_ON:
         return network(x)
-    with torch.autocast(x.device.type, torch.bfloat16):
+    with torch.autocast(MIXED_ON, torch.bfloat16):
         return network(x).float()
 
 

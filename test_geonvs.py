@@ -1944,7 +1944,7 @@ def test_refining_moves_features_and_adams_moments_along_with_their_corners(warm
 def test_mixed_precision_leaves_the_sdf_alone(warm, monkeypatch):
     batch = make_batch(warm)
     full, _, out = warm.losses(*batch, 0, generator())
-    monkeypatch.setattr(geonvs, "MIXED_ON", {"cpu"})
+    monkeypatch.setattr(geonvs, "MIXED_ON", "cpu")
     mixed, _, mixed_out = warm.losses(*batch, 0, generator())
     close(mixed, full, 0.01)
     assert mixed != full
