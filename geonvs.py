@@ -493,8 +493,9 @@ class SDFField(nn.Module):
         super().__init__()
         self.octree = octree
         self.network = mlp(3 + octree.width, hidden, 1 + GEO)
-        nn.init.normal_(self.network[2].weight[0], std=0.01)
-        nn.init.zeros_(self.network[2].bias)
+        last = self.network[2]
+        nn.init.normal_(last.weight[0], std=0.01)
+        nn.init.zeros_(last.bias)
         self.taps = torch.tensor(TAPS)  # (5,3)
 
     def forward(self, x):
