@@ -383,7 +383,7 @@ class Octree(nn.Module):
     def forward(self, x):
         """Features (...,LC) at x (...,3)."""
         node, place = self.locate(x.flatten(0, -2))  # of P points
-        exists = F.pad(node.diff() > 0, (1, 0), value=True)  # (P,L) or a coarser cell's
+        exists = node.diff(prepend=node[:, :1] - 1) > 0  # (P,L) or a coarser cell's
         node = node.flatten()  # (PL,)
         w = corner_weights(place.flatten(0, 1))  # (PL,8)
         w = w * self.is_free.index_select(0, node) * exists.reshape(-1, 1)
