@@ -588,7 +588,7 @@ class SDFCache(nn.Module):
         zeta = zeta.detach().clamp_max(self.volume.shape[-1])  # surfaces at least half a voxel wide
         weight = composite(neus_alpha(self.sdf(rays.at(probes)), zeta))  # (R,N)
         even = EVEN * weight.mean(1, keepdim=True)
-        n = jitter.shape[1]
+        _, n = jitter.shape
         u = (torch.arange(n, device=t0.device) + jitter) / n  # (R,S-1)
         inner = inverse_cdf(probes, weight + even + 1e-5, u)
         return torch.hstack([t0, inner, t1])
