@@ -874,8 +874,8 @@ class GeoNVS(nn.Module):
         if cfg.mask != "off":
             logit = sample_logits(self.mask.logits(photos), rays.uv)  # (R,)
             mask = logit.detach().sigmoid()
-            dynamic = error * ~rays.is_static  # (R,) SfM pixels: M = 0 [D10]
-            excess = dynamic - self.mask.price(phi, cfg)  # (R,)
+            # (R,) as if SfM pixels had no error, for M = 0 [D10]
+            excess = error * ~rays.is_static - self.mask.price(phi, cfg)
             if done < TAUGHT:
                 l_mask = transient_loss(logit, excess)
             mask = reject_outliers(mask, excess > 0, done)
