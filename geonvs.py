@@ -963,8 +963,7 @@ class GeoNVS(nn.Module):
         if self.cfg.mask == "auto":
             photos = self.scene.photos(False)[:64]
             share = self.mask.logits(photos).sigmoid().mean().item()
-            is_needed = from_first_process(share > 0.01)
-            self.cfg.mask = "on" if is_needed else "off"
+            self.cfg.mask = from_first_process("on" if share > 0.01 else "off")
             print(f"  mean mask {share:.4f}: mask {self.cfg.mask}")
 
     def codes(self):
