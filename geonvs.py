@@ -811,8 +811,9 @@ class GeoNVS(nn.Module):
         if levels == 0:  # no cell smaller than a pixel [D15]
             pixels = 2 / raw["footprint"]  # across the sphere; footprint: a pixel's size there
             levels = int(np.clip(1 + np.log2(pixels / ROOT), 2, 8))
-        has_codes = is_on(cfg.appearance, raw["exposure_spread"] > 0.01)
-        A = cfg.appearance_dim if has_codes else 0
+        A = 0
+        if is_on(cfg.appearance, raw["exposure_spread"] > 0.01):
+            A = cfg.appearance_dim
         is_inside = scene.points.norm(dim=1) < 1
         self.sfm = scene.points[is_inside]  # (N,3), never empty: data_prep places the sphere so
         octree = Octree(1.0, levels)
