@@ -1087,7 +1087,7 @@ def read_checkpoint(path, given):
           "name the run by the --scene, --data, --seed or --name it was made with")
     try:
         data_prep.refuse_bomb(path)
-        saved = torch.load(path, map_location="cpu", weights_only=True)
+        saved = dict(torch.load(path, map_location="cpu", weights_only=True))
         return saved, Config(**saved["config"] | given)
     except Exception as error:  # a damaged file can fail in any layer: zip, pickle, tensor storage
         raise UserError(f"{path} is damaged, too large for the memory or of another program "
