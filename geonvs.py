@@ -168,16 +168,13 @@ class Scene(NamedTuple):
     K: Tensor  # (I,4) fx fy cx cy in px
     c2w: Tensor  # (I,3,4)
     near: Tensor  # (I,) smallest useful t
-    is_test: Tensor  # (I,)
     points: Tensor  # (K,3) SfM points
     thumbs: Tensor  # (I,3,n,n) uint8, whole photos for the mask network
     static: Tensor  # (I,n/2,n/2) mask pixels that show SfM points; some wrongly, at outlines [D10]
+    train: Tensor  # (B,) numbers of the photos to train on
+    test: Tensor  # (B,) numbers of the held-out photos
     raw: dict  # the file in numpy: names, statistics, center, scale, ground truth of the toy
     info: dict  # what the file was made from; a checkpoint fits only the same
-
-    def photos(self, is_test):
-        """Numbers (B,) of the held-out photos, or of those to train on."""
-        return torch.where(self.is_test == is_test)[0]
 
 
 def load_scene(raw, device="cpu"):
@@ -192,8 +189,10 @@ def load_scene(raw, device="cpu"):
     col, row = (uv[is_seen] * n).astype(int).T
     static = np.zeros((len(thumbs), n, n), bool)
     static[raw["track_photo"][is_seen], row, col] = True
-    arrays = [raw[key] for key in Scene._fields[:8]]
+    arrays = [raw[key] for key in Scene._fields[:7]]
     arrays += [np.moveaxis(thumbs, 3, 1), static]
+    is_test = raw["is_test"]
+    arrays += [np.flatnonzero(~is_test), np.flatnonzero(is_test)]
     tensors = []
     for array in arrays:
         tensor = torch.as_tensor(array, device=device)
@@ -961,7 +960,7 @@ class GeoNVS(nn.Module):
     def decide_mask(self):
         """--mask auto: off if M marks hardly anything in 64 training photos. [D15]"""
         if self.cfg.mask == "auto":
-            photos = self.scene.photos(False)[:64]
+            photos = self.scene.train[:64]
             share = self.mask.logits(photos).sigmoid().mean().item()
             self.cfg.mask = from_first_process("on" if share > 0.01 else "off")
             print(f"  mean mask {share:.4f}: mask {self.cfg.mask}")
@@ -1131,7 +1130,7 @@ def train(cfg, scene, run, saved=None, kind=GeoNVS):
         (run / name).unlink(missing_ok=True)
     meter = metered_joules(gen.device, state.joules)
     next(meter, None)  # it counts from here
-    photos = scene.photos(False)
+    photos = scene.train
     begin = time.perf_counter() - state.seconds
     next_log = 0.0
     done = share_done(cfg, state)
@@ -1196,7 +1195,7 @@ def make_lpips():
 
 def mean_code(model):
     """Mean appearance code (A,) of the training photos."""
-    return model.codes()[~model.scene.is_test].mean(0)
+    return model.codes()[model.scene.train].mean(0)
 
 
 def fit_codes(model, scene, photos, steps=128, n=64):
@@ -1268,12 +1267,11 @@ def score(rgb, truth, lpips=None):
 def evaluate(model, scene, lpips=None):
     """Scores of the test photos by the half-image protocol [D12], per photo and on average, None
     where there are none; codes (I,A) of all photos, those of test photos fitted."""
-    photos = scene.photos(True)  # (B,)
     codes = model.codes().clone()
-    for some in photos.split(32):
+    for some in scene.test.split(32):
         codes[some] = fit_codes(model, scene, some)
     rows = []
-    for photo in progress(photos.tolist(), "scoring held-out photos"):
+    for photo in progress(scene.test.tolist(), "scoring held-out photos"):
         rgb, truth, _ = render_photo(model, scene, photo, codes[photo])
         row = score(rgb, truth, lpips)
         row["name"] = scene.raw["name"][photo]
@@ -1305,7 +1303,7 @@ def toy_truth(model, scene):
         return truth
     masks = [
         sample_logits(model.mask.logits([photo]), photo_rays(scene, photo).uv).sigmoid()
-        for photo in scene.photos(False).tolist()]
+        for photo in scene.train.tolist()]
     mask = torch.cat(masks).cpu().numpy()
     people = raw["occluder"][np.repeat(~raw["is_test"], np.diff(raw["start"]))]  # by pixel
     truth["mask_static"] = float(mask[~people].mean())
@@ -1360,10 +1358,10 @@ def write_panel(path, model, scene, codes):
     """A row for two held-out photos and two of training: photo, render under codes (I,A), normals
     of the surface, and what the mask network says of the photo."""
     rows = []
-    for photo in scene.photos(True)[:2].tolist() + scene.photos(False)[:2].tolist():
+    for photo in scene.test[:2].tolist() + scene.train[:2].tolist():
         rgb, truth, normal = render_photo(model, scene, photo, codes[photo])
         tiles = [truth, rgb, normal / 2 + 0.5]
-        kind = "held out" if scene.is_test[photo] else "training"
+        kind = "held out" if photo in scene.test else "training"
         text = f"{kind}: {scene.raw['name'][photo]}, render, normals"
         if model.cfg.mask != "off":
             M = model.mask.logits([photo])[0, 0].detach().sigmoid().cpu()  # (n/2,n/2)
@@ -1427,7 +1425,7 @@ def finish(model, scene, state, run):
 def film(model, scene, path):
     """mp4 at 24 frames/s: the first training camera sways sideways, by a tenth of the sphere's
     radius, while its photo's light turns into the last photo's."""
-    photo, other = scene.photos(False)[[0, -1]].tolist()
+    photo, other = scene.train[[0, -1]].tolist()
     first, last = model.codes()[[photo, other]]  # (A,)
     size = scene.wh[photo].tolist()  # px; of an odd side cv2 leaves out the last pixel
 
@@ -1487,7 +1485,7 @@ def execute(cfg, scene, run, saved=None, kind=GeoNVS):
     """Trains and scores one model; returns its metrics, in the first process."""
     os.makedirs(run, exist_ok=True)
     print(f"{kind.name} on {scene.info['scene']}: {len(scene.wh)} photos, "
-          f"{len(scene.photos(True))} held out; {scene.c2w.device}; {run}/")
+          f"{len(scene.test)} held out; {scene.c2w.device}; {run}/")
     model, state = train(cfg, scene, run, saved, kind)
     if RANK == 0:
         return finish(model, scene, state, run)

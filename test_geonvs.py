@@ -125,7 +125,7 @@ def warm(warm_start):
 
 def make_batch(model, n=64):
     """n rays of training photos, and the photos."""
-    return model.batch(model.scene.photos(False), n, generator())
+    return model.batch(model.scene.train, n, generator())
 
 
 def fake_rays(o, d):
@@ -1853,7 +1853,8 @@ def test_codes_and_background_follow_the_scene_unless_they_are_set(scene, settin
 def test_an_automatic_mask_goes_off_if_it_marks_nothing_in_training_photos(
         warm, monkeypatch, setting, held_out, trained, wanted):
     warm.cfg.mask = setting
-    level = torch.where(warm.scene.is_test, held_out, trained)
+    level = torch.full((8,), trained)
+    level[warm.scene.test] = held_out
     monkeypatch.setattr(warm.mask, "logits", lambda i: level[i])
     warm.decide_mask()
     assert warm.cfg.mask == wanted
@@ -1980,7 +1981,7 @@ def to_meta(value):
 def train_on_meta(model, monkeypatch):
     """Takes steps on a device that has no values to be asked for."""
     monkeypatch.setattr(adam, "_device_dtype_check_for_fused", mock.Mock())
-    photos = to_meta(model.scene.photos(False))
+    photos = to_meta(model.scene.train)
     model.scene = geonvs.Scene(*map(to_meta, model.scene))
     model.to("meta")
     for module in model.modules():
@@ -2131,7 +2132,7 @@ def loop(desk, monkeypatch):
 
 
 def test_a_step_is_adams_on_the_gradient_of_its_losses(warm, scene):
-    photos = scene.photos(False)
+    photos = scene.train
     twin = copy.deepcopy(warm)
     optimizer = geonvs.make_optimizer(warm)
     adam = geonvs.make_optimizer(twin)
@@ -2155,7 +2156,7 @@ def test_a_step_is_adams_on_the_gradient_of_its_losses(warm, scene):
     (0, 0, 0.05), (19, 0, 1), (500, 0.5, 0.525), (9, 1, 0.025)])
 def test_the_learning_rate_warms_up_and_falls_by_a_cosine(warm, scene, step, done, share):
     optimizer = geonvs.make_optimizer(warm)
-    geonvs.training_step(warm, optimizer, scene.photos(False), step, done, generator())
+    geonvs.training_step(warm, optimizer, scene.train, step, done, generator())
     rates = [group["lr"] for group in optimizer.param_groups]
     assert_close(rates, [share * rate for rate in warm.rates])
 
@@ -2432,13 +2433,13 @@ def test_lpips_gets_the_right_half_in_0_to_1_and_a_small_picture_has_no_score():
 
 
 def test_fitting_codes_leaves_no_gradients_in_the_model(warm, scene):
-    geonvs.fit_codes(warm, scene, scene.photos(True), steps=1)
+    geonvs.fit_codes(warm, scene, scene.test, steps=1)
     assert all(p.grad is None and p.requires_grad for p in warm.parameters())
 
 
 def test_fitting_goes_from_the_mean_training_code_to_the_colour_of_each_left_half(scene):
     raw = scene.raw | dict(rgb=np.full_like(scene.raw["rgb"], 255))
-    photos = scene.photos(True)
+    photos = scene.test
     for number in photos:
         half = raw["wh"][number, 0] // 2
         photo(raw, number)[:, :half] = 30 * number
@@ -2449,13 +2450,13 @@ def test_fitting_goes_from_the_mean_training_code_to_the_colour_of_each_left_hal
         scene=scene)
     start = geonvs.fit_codes(model, scene, photos, steps=0)
     found = geonvs.fit_codes(model, geonvs.load_scene(raw), photos)
-    assert_close(start, codes[~scene.is_test].mean(0).expand(2, 3))
+    assert_close(start, codes[scene.train].mean(0).expand(2, 3))
     assert_close(found, 30 * photos.expand(3, 2).T / 255, atol=0.03)
 
 
 def test_without_codes_nothing_is_fitted(scene):
     model = make_model(scene, appearance="off")
-    codes = geonvs.fit_codes(model, scene, scene.photos(True))
+    codes = geonvs.fit_codes(model, scene, scene.test)
     assert codes.shape == (2, 0)
 
 
@@ -2487,11 +2488,11 @@ def test_a_model_that_knows_the_right_halves_gets_perfect_scores(knowing, scene)
     assert scores["psnr"] == pytest.approx(100)
     assert scores["psnr_floor"] == np.mean([row["psnr_floor"] for row in rows])
     assert [row["name"] for row in rows] == scene.raw["name"][scene.raw["is_test"]].tolist()
-    assert torch.equal(is_same, ~scene.is_test)  # codes of test photos are fitted
+    assert torch.equal(is_same.nonzero()[:, 0], scene.train)  # codes of test photos are fitted
 
 
 def test_a_scene_without_held_out_photos_has_no_scores(warm, scene):
-    scene = scene._replace(is_test=torch.zeros_like(scene.is_test))
+    scene = scene._replace(test=scene.test[:0])
     scores, _ = geonvs.evaluate(warm, scene)
     assert scores == dict(per_image=[], psnr=None, psnr_floor=None, ssim=None, lpips=None)
 
@@ -3604,7 +3605,7 @@ def test_losses_of_rivals_are_finite_and_reach_every_parameter(scene, name):
     model = rival(scene, name)
     gen = generator()
     for step in range(2):  # the second knows another photo's code
-        rays, photos = model.batch(scene.photos(False), 256, gen)
+        rays, photos = model.batch(scene.train, 256, gen)
         loss, terms, _ = model.losses(rays, photos, step, gen)
         model.zero_grad()
         loss.backward()
@@ -3615,7 +3616,7 @@ def test_losses_of_rivals_are_finite_and_reach_every_parameter(scene, name):
 
 def test_nerfw_mixes_static_and_transient_as_its_equation_says(scene):
     model = rival(scene, "nerfw")
-    rays, _ = model.batch(scene.photos(False), 64, generator())
+    rays, _ = model.batch(scene.train, 64, generator())
     t = torch.tensor([[1.0, 1.5, 1.7]]).repeat(64, 1)
     code = model.codes()[rays.img]
     other = torch.ones(64, 16)
