@@ -929,8 +929,9 @@ class GeoNVS(nn.Module):
         node, _ = octree.locate(out["end"])
         octree.record.index_add_(0, node[:, -1], columns)
 
-    def batch(self, photos, n, gen):
+    def batch(self, n, gen):
         """n random rays and the photos (B,) they come from, photo by photo."""
+        photos = self.scene.train
         picked = photos[random_index(gen, len(photos), self.cfg.photos)]  # (B,)
         img = picked.repeat_interleave(n // len(picked))  # (R,)
         return random_rays(self.scene, img, gen), picked
@@ -1035,11 +1036,11 @@ def average_gradients(model):
             p.grad /= RANKS
 
 
-def training_step(model, optimizer, photos, step, done, gen):
+def training_step(model, optimizer, step, done, gen):
     """One update; the learning rate rises for 20 steps, then follows a cosine down to 5 %. done:
     share of training, 0..1. Returns the raw terms of the loss. Never waits for the device."""
     model.before_step(step, done)
-    rays, picked = model.batch(photos, model.cfg.rays // RANKS, gen)
+    rays, picked = model.batch(model.cfg.rays // RANKS, gen)
     loss, terms, out = model.losses(rays, picked, done, gen)
     optimizer.zero_grad()
     loss.backward()
@@ -1130,12 +1131,11 @@ def train(cfg, scene, run, saved=None, kind=GeoNVS):
         (run / name).unlink(missing_ok=True)
     meter = metered_joules(gen.device, state.joules)
     next(meter, None)  # it counts from here
-    photos = scene.train
     begin = time.perf_counter() - state.seconds
     next_log = 0.0
     done = share_done(cfg, state)
     while done < 1:
-        terms = training_step(model, optimizer, photos, state.step, done, gen)
+        terms = training_step(model, optimizer, state.step, done, gen)
         state.step += 1
         # several processes agree on time now and then, and at the last step
         if RANKS == 1 or state.step % 16 == 0 or state.step == cfg.steps:

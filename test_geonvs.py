@@ -125,7 +125,7 @@ def warm(warm_start):
 
 def make_batch(model, n=64):
     """n rays of training photos, and the photos."""
-    return model.batch(model.scene.train, n, generator())
+    return model.batch(n, generator())
 
 
 def fake_rays(o, d):
@@ -1756,6 +1756,16 @@ def test_observing_follows_quantiles_and_records_where_foreground_rays_end(warm)
 
 # ---- 7 model and objective -----------------------------------------------------------------------
 
+def test_batches_come_photo_by_photo_from_those_to_train_on(warm):
+    gen = generator()
+    met = set()
+    for _ in range(20):
+        rays, photos = warm.batch(64, gen)
+        assert torch.equal(rays.img, photos.repeat_interleave(16))
+        met.update(photos.tolist())
+    assert met == {0, 1, 3, 4, 5, 7}  # the others are held out
+
+
 def plain_losses(model, rays, done):
     """Terms of the objective by a loop over eight rays; the lesson is the mask's."""
     cfg = model.cfg
@@ -1981,7 +1991,6 @@ def to_meta(value):
 def train_on_meta(model, monkeypatch):
     """Takes steps on a device that has no values to be asked for."""
     monkeypatch.setattr(adam, "_device_dtype_check_for_fused", mock.Mock())
-    photos = to_meta(model.scene.train)
     model.scene = geonvs.Scene(*map(to_meta, model.scene))
     model.to("meta")
     for module in model.modules():
@@ -1990,7 +1999,7 @@ def train_on_meta(model, monkeypatch):
     optimizer = geonvs.make_optimizer(model)
     with OneDevice():
         for step, done in ((7, 0.1), (64, 0.7)):
-            geonvs.training_step(model, optimizer, photos, step, done, MetaGenerator())
+            geonvs.training_step(model, optimizer, step, done, MetaGenerator())
 
 
 @pytest.mark.parametrize("mask", ["on", "off"])
@@ -2131,17 +2140,16 @@ def loop(desk, monkeypatch):
     return calls
 
 
-def test_a_step_is_adams_on_the_gradient_of_its_losses(warm, scene):
-    photos = scene.train
+def test_a_step_is_adams_on_the_gradient_of_its_losses(warm):
     twin = copy.deepcopy(warm)
     optimizer = geonvs.make_optimizer(warm)
     adam = geonvs.make_optimizer(twin)
     gen = generator()
     again = generator()
     for step in (30, 31):
-        geonvs.training_step(warm, optimizer, photos, step, 0.0, gen)
+        geonvs.training_step(warm, optimizer, step, 0.0, gen)
         twin.before_step(step, 0.0)
-        rays, picked = twin.batch(photos, 64, again)
+        rays, picked = twin.batch(64, again)
         loss, _, out = twin.losses(rays, picked, 0.0, again)
         adam.zero_grad()
         loss.backward()
@@ -2154,18 +2162,17 @@ def test_a_step_is_adams_on_the_gradient_of_its_losses(warm, scene):
 
 @pytest.mark.parametrize("step, done, share", [
     (0, 0, 0.05), (19, 0, 1), (500, 0.5, 0.525), (9, 1, 0.025)])
-def test_the_learning_rate_warms_up_and_falls_by_a_cosine(warm, scene, step, done, share):
+def test_the_learning_rate_warms_up_and_falls_by_a_cosine(warm, step, done, share):
     optimizer = geonvs.make_optimizer(warm)
-    geonvs.training_step(warm, optimizer, scene.train, step, done, generator())
+    geonvs.training_step(warm, optimizer, step, done, generator())
     rates = [group["lr"] for group in optimizer.param_groups]
     assert_close(rates, [share * rate for rate in warm.rates])
 
 
 def test_a_budget_in_minutes_replaces_steps(loop):
     _, state = run_training(steps=2, minutes=2.5)
-    calls = [call.args[2:5] for call in loop.step.call_args_list]
-    photos, steps, done = zip(*calls)
-    assert photos[0].tolist() == [0, 1, 3, 4, 5, 7]  # the others are held out
+    calls = [call.args[2:4] for call in loop.step.call_args_list]
+    steps, done = zip(*calls)
     assert steps == tuple(range(15))
     assert_close(done, np.arange(15) / 15)
     assert logged_steps() == [1, 4, 7, 10, 13, 15]  # every 30 s
@@ -2237,7 +2244,7 @@ def train_until_killed():
     step = geonvs.training_step
 
     def step_or_die(*args):
-        if args[3] == 5:
+        if args[2] == 5:
             signal.raise_signal(signal.SIGKILL)
         return step(*args)
     patch.setattr(geonvs, "training_step", step_or_die)
@@ -2969,8 +2976,9 @@ class HaNeRF(NeRFW):
         photos = torch.arange(len(self.scene.wh), device=self.bank.device)
         return torch.cat([self.encode(some) for some in photos.split(8)])
 
-    def batch(self, photos, n, gen):
+    def batch(self, n, gen):
         """A square grid of rays over a random window of one photo."""
+        photos = self.scene.train
         picked = photos[geonvs.random_index(gen, len(photos), 1)]
         size = 0.5 + 0.5 * geonvs.uniform(gen, 1)
         corner = geonvs.uniform(gen, 2) * (1 - size)
@@ -3605,7 +3613,7 @@ def test_losses_of_rivals_are_finite_and_reach_every_parameter(scene, name):
     model = rival(scene, name)
     gen = generator()
     for step in range(2):  # the second knows another photo's code
-        rays, photos = model.batch(scene.train, 256, gen)
+        rays, photos = model.batch(256, gen)
         loss, terms, _ = model.losses(rays, photos, step, gen)
         model.zero_grad()
         loss.backward()
@@ -3616,7 +3624,7 @@ def test_losses_of_rivals_are_finite_and_reach_every_parameter(scene, name):
 
 def test_nerfw_mixes_static_and_transient_as_its_equation_says(scene):
     model = rival(scene, "nerfw")
-    rays, _ = model.batch(scene.train, 64, generator())
+    rays, _ = model.batch(64, generator())
     t = torch.tensor([[1.0, 1.5, 1.7]]).repeat(64, 1)
     code = model.codes()[rays.img]
     other = torch.ones(64, 16)
