@@ -291,8 +291,8 @@ class WeightedSum(torch.autograd.Function):
 
 
 def grid_index(n, like):
-    """All index triples (n^3,3) of a cube of n^3 cells, the last index fastest, beside `like`."""
-    return like.new_ones(n, n, n).nonzero()
+    """All cells (n^3,4) of level 0 with indices below n, the last one fastest, beside `like`."""
+    return like.new_ones(1, n, n, n).nonzero()
 
 
 def number_of(index, n=2**13):
@@ -330,18 +330,18 @@ class Octree(nn.Module):
         """Makes cells and corners from the keys of the cells that are split, all that were split
         before among them. New features are zero. Returns which rows (V,) are old, in old order."""
         self.split_keys = split_keys
-        octants = grid_index(2, split_keys)  # (8,3)
-        index = grid_index(self.root, split_keys)  # (N,3)
+        octants = grid_index(2, split_keys)  # (8,4)
+        cells = grid_index(self.root, split_keys)  # (N,4)
         levels = []
         splits = []
         for level in range(self.levels):
-            cells = F.pad(index, (1, 0), value=level)  # (N,4)
+            cells[:, 0] = level
             is_split = torch.isin(number_of(cells), split_keys)  # (N,)
             is_split &= level < self.levels - 1
             levels.append(cells)
             splits.append(is_split)
-            children = 2 * index[is_split, None] + octants  # (N,8,3)
-            index = children.flatten(0, 1)
+            children = 2 * cells[is_split, None] + octants  # (N,8,4) but for the level
+            cells = children.flatten(0, 1)
         self.cells = torch.cat(levels)  # (N,4) level, i, j, k
         self.finest = self.side[self.cells[-1, 0]].item()  # side of the smallest cell
         is_split = torch.cat(splits)
@@ -350,7 +350,7 @@ class Octree(nn.Module):
         # (N,3) of rays that end in a cell, sums of: error, size of a pixel there, 1
         self.record = nn.Buffer(self.features.new_zeros(len(first), 3))
 
-        corners = number_of(self.cells[:, None] + F.pad(octants, (1, 0)))  # (N,8) keys
+        corners = number_of(self.cells[:, None] + octants)  # (N,8) keys
         key, number, cells_around = corners.unique(return_inverse=True, return_counts=True)
         is_whole = cells_around == 8  # (.,) has a feature
         row = (is_whole.cumsum(0) - 1).clamp_min(0)  # any row, where hanging
@@ -410,7 +410,8 @@ def seed_octree(octree, points, dense):
     [D10]"""
     for _ in range(dense):
         octree.split(octree.cells)
-    neighbours = F.pad(grid_index(3, points) - 1, (1, 0))  # (27,4)
+    neighbours = grid_index(3, points)  # (27,4)
+    neighbours[:, 1:] -= 1
     for _ in range(2):
         node, _ = octree.locate(points)
         home = octree.cells[node[:, -1].unique()]  # (N,4)
