@@ -1113,14 +1113,14 @@ def restore(saved, model, gen=None):
                         "and kind of device as it was made with, or another --name")
 
 
-def train(cfg, scene, run, saved=None, kind=GeoNVS):
+def train(cfg, scene, run, saved=None):
     """Trains until cfg.steps or cfg.minutes; writes log.jsonl and checkpoint.pt below run. saved: a
-    checkpoint to go on from; kind: GeoNVS, or a rival with its methods. Returns model and state."""
+    checkpoint to go on from. Returns model and state."""
     torch.set_flush_denormal(True)  # vanishing weights would otherwise slow a CPU down
     torch.manual_seed(cfg.seed)
     gen = torch.Generator(scene.c2w.device).manual_seed(cfg.seed + RANK)
     with gen.device:
-        model = kind(cfg, scene)
+        model = GeoNVS(cfg, scene)
     stale = RESULTS
     if saved is None:
         optimizer = make_optimizer(model)
@@ -1388,7 +1388,7 @@ def finish(model, scene, state, run):
         machine = torch.cuda.get_device_name()
     scores, codes = evaluate(model, scene, make_lpips())
     write_panel(run / "panel.png", model, scene, codes)
-    if isinstance(model, GeoNVS):
+    if model.octrees:  # a rival has none
         scores["octree_cells"] = model.sdf.octree.cells[:, 0].bincount().tolist()  # by level
         write_ply(run / "mesh.ply", *extract_mesh(model))
         if "wall" in scene.raw:  # the toy
@@ -1482,12 +1482,12 @@ def make_config(given):
     return cfg
 
 
-def execute(cfg, scene, run, saved=None, kind=GeoNVS):
+def execute(cfg, scene, run, saved=None):
     """Trains and scores one model; returns its metrics, in the first process."""
     os.makedirs(run, exist_ok=True)
-    print(f"{kind.name} on {scene.info['scene']}: {len(scene.wh)} photos, "
+    print(f"{GeoNVS.name} on {scene.info['scene']}: {len(scene.wh)} photos, "
           f"{len(scene.test)} held out; {scene.c2w.device}; {run}/")
-    model, state = train(cfg, scene, run, saved, kind)
+    model, state = train(cfg, scene, run, saved)
     if RANK == 0:
         return finish(model, scene, state, run)
 

@@ -3436,10 +3436,10 @@ def train_row(cfg, arrays, run, row):
     """Trains and scores, with what the row replaces; writes log.txt below run."""
     run.mkdir(parents=True, exist_ok=True)
     scene = geonvs.load_scene(arrays, geonvs.pick_device(cfg.device))
-    replaced = mock.patch.dict(vars(geonvs), row.replaced)
+    replaced = mock.patch.dict(vars(geonvs), row.replaced, GeoNVS=row.kind)
     with replaced, open(run / "log.txt", "w") as log, contextlib.redirect_stdout(log):
         try:
-            return geonvs.execute(cfg, scene, run, kind=row.kind)
+            return geonvs.execute(cfg, scene, run)
         except UserError as error:
             if error.__cause__:  # a full disk is no result of the method
                 raise
