@@ -1116,6 +1116,9 @@ def restore(saved, model, gen=None):
 def train(cfg, scene, run, saved=None):
     """Trains until cfg.steps or cfg.minutes; writes log.jsonl and checkpoint.pt below run. saved: a
     checkpoint to go on from. Returns model and state."""
+    os.makedirs(run, exist_ok=True)
+    print(f"{GeoNVS.name} on {scene.info['scene']}: {len(scene.wh)} photos, "
+          f"{len(scene.test)} held out; {scene.c2w.device}; {run}/")
     torch.set_flush_denormal(True)  # vanishing weights would otherwise slow a CPU down
     torch.manual_seed(cfg.seed)
     gen = torch.Generator(scene.c2w.device).manual_seed(cfg.seed + RANK)
@@ -1482,16 +1485,6 @@ def make_config(given):
     return cfg
 
 
-def execute(cfg, scene, run, saved=None):
-    """Trains and scores one model; returns its metrics, in the first process."""
-    os.makedirs(run, exist_ok=True)
-    print(f"{GeoNVS.name} on {scene.info['scene']}: {len(scene.wh)} photos, "
-          f"{len(scene.test)} held out; {scene.c2w.device}; {run}/")
-    model, state = train(cfg, scene, run, saved)
-    if RANK == 0:
-        return finish(model, scene, state, run)
-
-
 def start_processes(device):
     """Joins the processes that torchrun started; the first one speaks."""
     check("MASTER_ADDR" in os.environ, "start processes by torchrun, or unset WORLD_SIZE")
@@ -1528,7 +1521,9 @@ def main(argv=None):
         if RANK == 0:
             film(model, scene, run / "film.mp4")
     else:
-        execute(cfg, scene, run, saved)
+        model, state = train(cfg, scene, run, saved)
+        if RANK == 0:
+            finish(model, scene, state, run)
     if RANKS > 1:
         dist.destroy_process_group()
 

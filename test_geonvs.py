@@ -2106,7 +2106,6 @@ def pass_time(patch, seconds):
 
 def run_training(saved=None, **changes):
     """Model and state of a run on the tiny toy."""
-    RUN.mkdir(parents=True, exist_ok=True)
     scene = geonvs.load_scene(toy())
     return geonvs.train(tiny(**changes), scene, RUN, saved)
 
@@ -3439,7 +3438,8 @@ def train_row(cfg, arrays, run, row):
     replaced = mock.patch.dict(vars(geonvs), row.replaced, GeoNVS=row.kind)
     with replaced, open(run / "log.txt", "w") as log, contextlib.redirect_stdout(log):
         try:
-            return geonvs.execute(cfg, scene, run)
+            model, state = geonvs.train(cfg, scene, run)
+            return geonvs.finish(model, scene, state, run)
         except UserError as error:
             if error.__cause__:  # a full disk is no result of the method
                 raise
@@ -3759,7 +3759,7 @@ def test_an_experiment_writes_table_and_figure_and_reads_rows_again(
     table = Path(f"{name}.csv").read_text()
     assert len(table.splitlines()) == 1 + rows
     assert Path(f"{name}.png").stat().st_size > 1000
-    monkeypatch.setattr(geonvs, "execute", None)  # nothing is trained again
+    monkeypatch.setattr(geonvs, "train", None)  # nothing is trained again
     experiment(argv)
     assert Path(f"{name}.csv").read_text() == table
 
@@ -3774,7 +3774,7 @@ def fill_disk(*_, **__):
 
 @pytest.mark.parametrize("fail, message", {diverge: "first row", fill_disk: "write"}.items())
 def test_a_failed_run_is_a_result_and_a_full_disk_is_none(quick_rows, fail, message, monkeypatch):
-    monkeypatch.setattr(geonvs, "execute", fail)
+    monkeypatch.setattr(geonvs, "train", fail)
     with pytest.raises(UserError, match=message):
         experiment(["grid", *quick_rows])
 
