@@ -1124,11 +1124,10 @@ def train(cfg, scene, run, saved=None):
     gen = torch.Generator(scene.c2w.device).manual_seed(cfg.seed + RANK)
     with gen.device:
         model = GeoNVS(cfg, scene)
+    optimizer = make_optimizer(model)
+    state = State()
     stale = RESULTS
-    if saved is None:
-        optimizer = make_optimizer(model)
-        state = State()
-    else:
+    if saved:
         optimizer, state = restore(saved, model, gen)
         stale = RESULTS[2:]  # checkpoint and log go on
     for name in stale:  # nothing of a former run may be taken for this one's
