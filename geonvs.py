@@ -565,6 +565,7 @@ class SDFCache(nn.Module):
     """The SDF on a dense grid, up to 63 steps old: where along a ray samples pay. [D11]"""
     def __init__(self, n):
         super().__init__()
+        self.n = n
         self.volume = nn.Buffer(torch.zeros(1, 1, n, n, n))  # x slowest
         line = torch.linspace(-1, 1, n)
         self.points = torch.cartesian_prod(line, line, line)  # (P,3)
@@ -584,7 +585,7 @@ class SDFCache(nn.Module):
         (R,S-1) in 0..1, stratifies those between the ends."""
         share = torch.linspace(0, 1, 65, device=t0.device)
         probes = t0.lerp(t1, share)  # (R,N+1) where the cache is looked up, which is cheap
-        zeta = zeta.detach().clamp_max(self.volume.shape[-1])  # surfaces at least half a voxel wide
+        zeta = zeta.detach().clamp_max(self.n)  # surfaces at least half a voxel wide
         weight = composite(neus_alpha(self.sdf(rays.at(probes)), zeta))  # (R,N)
         even = EVEN * weight.mean(1, keepdim=True)
         _, n = jitter.shape
@@ -1321,9 +1322,9 @@ def extract_mesh(model):
     octree cell, at most 512: vertices (P,3) in SfM units, faces (N,3). s is evaluated near the
     surface; elsewhere the cache gives its sign."""
     n = min(round(2 / model.eps), 512)
-    cache = model.cache.volume
-    volume = F.interpolate(cache, n + 1, mode="trilinear", align_corners=True)[0, 0]
-    near = volume.abs() < 6 / cache.shape[-1]
+    cache = model.cache
+    volume = F.interpolate(cache.volume, n + 1, mode="trilinear", align_corners=True)[0, 0]
+    near = volume.abs() < 6 / cache.n
     volume[near] = in_chunks(model.distance, near.nonzero() * (2 / n) - 1)
     volume = volume.cpu().numpy()
     square = np.linspace(-1, 1, n + 1) ** 2
