@@ -1205,7 +1205,7 @@ def mean_code(model):
 def fit_codes(model, scene, photos, steps=128, n=64):
     """Appearance codes (B,A) of unseen photos (B,): Adam on n random rays a step of each left half
     [D12], from the mean code of the training photos. The scene stays as it is."""
-    gen = torch.Generator(scene.c2w.device).manual_seed(0)
+    gen = torch.Generator(photos.device).manual_seed(0)
     codes = mean_code(model).repeat(len(photos), 1)  # (B,A)
     if codes.numel() == 0:
         return codes
@@ -1377,7 +1377,7 @@ def write_panel(path, model, scene, codes):
         row = np.insert(np.hstack(row), [0] * 20, 255, axis=0)  # 20 white lines for the title
         cv2.putText(row, text, (2, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.4, 0)
         rows.append(row)
-    atomic_write(path, lambda part: cv2.imwrite(str(part), np.vstack(rows)[:, :, ::-1]))
+    atomic_write(path, lambda part: cv2.imwrite(str(part), np.vstack(rows)[..., ::-1]))
 
 
 def finish(model, scene, state, run):
@@ -1438,10 +1438,10 @@ def film(model, scene, path):
         for n in progress(range(96), "filming 96 frames"):
             share = n / 95
             c2w = scene.c2w.clone()
-            c2w[:, :, 3] += 0.1 * math.sin(math.tau * share) * c2w[:, :, 0]
+            c2w[..., 3] += 0.1 * math.sin(math.tau * share) * c2w[..., 0]
             view = scene._replace(c2w=c2w)
             rgb, _, _ = render_photo(model, view, photo, first.lerp(last, share))
-            video.write(to_uint8(rgb[:, :, ::-1]))
+            video.write(to_uint8(rgb[..., ::-1]))
         video.release()
         return part.stat().st_size > 0
     atomic_write(path, write)
