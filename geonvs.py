@@ -1197,16 +1197,12 @@ def make_lpips():
         return None
 
 
-def mean_code(model):
-    """Mean appearance code (A,) of the training photos."""
-    return model.codes()[model.scene.train].mean(0)
-
-
 def fit_codes(model, scene, photos, steps=128, n=64):
     """Appearance codes (B,A) of unseen photos (B,): Adam on n random rays a step of each left half
     [D12], from the mean code of the training photos. The scene stays as it is."""
     gen = torch.Generator(photos.device).manual_seed(0)
-    codes = mean_code(model).repeat(len(photos), 1)  # (B,A)
+    mean = model.codes()[scene.train].mean(0)  # (A,)
+    codes = mean.repeat(len(photos), 1)  # (B,A)
     if codes.numel() == 0:
         return codes
     adam = torch.optim.Adam([codes.requires_grad_()])
