@@ -797,7 +797,6 @@ class GeoNVS(nn.Module):
     """The paper's model: it assembles the parts above and sums their losses. Make it under
     torch.device(the scene's)."""
     name = "geonvsw"
-    adam = dict(betas=(0.9, 0.99), eps=1e-15)  # as is usual for feature grids (Instant-NGP)
 
     def __init__(self, cfg, scene):
         super().__init__()
@@ -1065,7 +1064,8 @@ def share_done(cfg, state):
 
 
 def make_optimizer(model):
-    return torch.optim.Adam(model.groups(), **model.adam, fused=True)
+    """Adam as is usual for feature grids (Instant-NGP)."""
+    return torch.optim.Adam(model.groups(), betas=(0.9, 0.99), eps=1e-15, fused=True)
 
 
 def save_checkpoint(path, model, optimizer, gen, state):

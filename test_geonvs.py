@@ -2798,7 +2798,7 @@ class Rival(nn.Module):
         self.make_parts(cfg, scene)
 
     def groups(self):
-        return [dict(params=list(self.parameters()))]
+        return [dict(params=list(self.parameters()), **self.adam)]
 
     def do_nothing(self, *_):
         pass
@@ -3168,7 +3168,7 @@ class Splats(Rival):
             list(self.paint.parameters()),
             [self.appearance.weight]]
         self.rates = (2e-3, 5e-2, 2e-2, 5e-2, 2e-2, 2e-3, self.cfg.lr_code)
-        return [dict(params=part) for part in parts]
+        return [dict(params=part, **self.adam) for part in parts]
 
     def render(self, rays, code):
         """rgb (R,3); the rays of each photo at once, under the code of the first of them. The
