@@ -1180,9 +1180,9 @@ def to_uint8(picture):
     return (picture.clip(0, 1) * 255 + 0.5).astype(np.uint8)
 
 
-def psnr(a, b):
-    """Peak signal-to-noise ratio in dB of two pictures in 0..1, numpy or torch; at most 100."""
-    mse = ((a - b) ** 2).mean()
+def psnr(error):
+    """Peak signal-to-noise ratio in dB for the error of a picture in 0..1; at most 100."""
+    mse = (error**2).mean()
     return -10 * math.log10(mse + 1e-10)
 
 
@@ -1246,8 +1246,8 @@ def score(rgb, truth, lpips=None):
     got = to_uint8(rgb[:, half:]) / 255
     side = min(got.shape[:2])
     row = dict(
-        psnr=psnr(got, want),
-        psnr_floor=psnr(truth[:, :half].mean(1, keepdims=True), want),
+        psnr=psnr(got - want),
+        psnr_floor=psnr(truth[:, :half].mean(1, keepdims=True) - want),
         ssim=None,
         lpips=None)
     if side >= 11:
