@@ -1703,6 +1703,12 @@ def test_a_mask_is_half_as_large_as_its_photo_and_starts_low(warm):
     assert 0.02 < logits.sigmoid().mean() < 0.2
 
 
+def test_the_mask_reads_bytes_of_photos_as_numbers_around_0(warm):
+    warm.mask.stages = warm.mask.heads = nn.ModuleList([nn.Identity()])
+    halved = F.avg_pool2d(warm.mask.thumbs[[3]].float(), 2)
+    close(warm.mask.logits([3]), halved / 255 - 0.5)
+
+
 def test_pixels_that_show_sfm_points_are_static(scene):
     wanted = torch.zeros(len(scene.wh), 32, 32, dtype=torch.bool)
     for photo, (u, v) in zip(scene.raw["track_photo"], scene.raw["track_uv"]):
@@ -1870,7 +1876,7 @@ def test_an_automatic_mask_goes_off_if_it_marks_nothing_in_training_photos(
     assert warm.cfg.mask == wanted
 
 
-@pytest.mark.parametrize("footprint", [0.5, 0.05, 0.03, 0.0001])
+@pytest.mark.parametrize("footprint", [0.5, 0.04, 0.03, 0.0001])
 def test_no_cell_is_smaller_than_a_pixel_and_none_needlessly_large(scene, footprint):
     other = scene._replace(raw=scene.raw | dict(footprint=footprint))
     model = make_model(other, levels=0)
@@ -2579,7 +2585,7 @@ def test_a_panel_shows_photo_render_normals_and_a_mask_from_left_to_right(
         warm, scene, desk, monkeypatch, mask, count):
     def render_photo(model, scene, photo, code):
         assert torch.equal(code, codes[photo])
-        return [np.full((24, 16, 3), color) for color in np.eye(3)]
+        return [np.full((24, 16, 3), color) for color in np.eye(3) / 2]
     codes = random(8, 4)
     warm.cfg.mask = mask
     monkeypatch.setattr(geonvs, "render_photo", render_photo)
@@ -2587,7 +2593,7 @@ def test_a_panel_shows_photo_render_normals_and_a_mask_from_left_to_right(
     geonvs.write_panel(Path("a.png"), warm, scene, codes)
     panel = cv2.imread("a.png")[:, :, ::-1]
     tiles = panel.reshape(4, 380, count, 240, 3)[:, 20:]  # below the titles
-    wanted = np.array([[0, 255, 0], [255, 0, 0], [128, 128, 255], [96, 96, 96]])
+    wanted = np.array([[0, 128, 0], [128, 0, 0], [128, 128, 191], [96, 96, 96]])
     assert (tiles == wanted[:count, None]).all()
 
 
