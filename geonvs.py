@@ -274,7 +274,7 @@ def corner_weights(f):
 
 class WeightedSum(torch.autograd.Function):
     """Row p of the result: the sum over 8 corners k of w[p,k] table[row[p,k]]. Only the table gets
-    a gradient, as derivatives in x are finite differences. The own backward of embedding_bag takes
+    a gradient, as derivatives in x are finite differences; embedding_bag's own backward takes
     several times as long."""
     @staticmethod
     def forward(ctx, table, row, w):  # (V,C), (P,8), (P,8) -> (P,C)
