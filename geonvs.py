@@ -33,7 +33,7 @@ Departures from the printed paper; their tags stand in the code, or in the docst
   [D4]  the curvature loss is |lap| eps opacity, since |lap| of a trilinear field grows as eps
         shrinks; its weight is 0.01 (printed: lambda_curv = 2 stands in Eq. 4 and in Eq. 5)
   [D5]  the Lipschitz term is a sum of logs, not a product that can drown the colour at first
-  [D6]  CGNet is small and sees small square photos: one plain block a stage, GroupNorm, ReLU
+  [D6]  CGNet is small and sees small square photos: one block a stage without gate, GroupNorm
   [D7]  M is learnt by classification. A ray is transient if its error (of the worst channel)
         exceeds the price of masking it,
         max(upper quartile of errors at SfM pixels + lam_mask, 0.15) + lam_gpl Phi; a lesson weighs
@@ -47,8 +47,8 @@ Departures from the printed paper; their tags stand in the code, or in the docst
         penalty, as trials were as good without, and no sphere loss: s starts as a small sphere
   [D11] samples are drawn from a cached SDF volume; no second network pass along the ray
   [D12] a test photo's code is fitted on its left half, its score is taken on the right half
-  [D13] derivatives are taken at the ray's end and, on every second ray, at a random sample, not
-        at all samples, which share the normal of the end in the colour network
+  [D13] derivatives are taken at the ray's end, at SfM points and near them, not at all samples,
+        which share the normal of the end in the colour network
   [D14] zeta stays above a rising floor, so that no surface stays fog, and below a fixed bound
   [D15] cells split where colours err, down to a pixel's size, and stay (the paper prunes empty
         space); a scene that needs no codes, no mask or no background field is modelled without
@@ -124,7 +124,7 @@ class Config:
     appearance: str = "auto"  # codes; auto: on if exposures differ
     mask: str = "auto"  # auto: off if it marks hardly anything
     background: str = "auto"  # field; auto: off if it is one colour
-    lam_eik: float = 0.04  # weight of the eikonal loss (Permuto-SDF)
+    lam_eik: float = 0.004  # weight of the eikonal loss (Permuto-SDF: 0.04)
     lam_curv: float = 0.01  # weight of the curvature loss, on |lap| eps [D4]
     lam_gpl: float = 0.05  # weight of the geometry-preservation loss (paper) [D7]
     lam_lps: float = 1e-5  # weight of the Lipschitz loss, log form [D5]
@@ -221,13 +221,13 @@ def make_rays(scene, img, pixel):
     w = wh[:, 0]
     focal, centre = scene.K[img].split(2, 1)  # (R,2)
     c2w = scene.c2w[img]  # (R,3,4)
-    xy = torch.column_stack([pixel % w, pixel // w]) + 0.5  # (R,2) px
+    xy = torch.stack([pixel % w, pixel // w], 1) + 0.5  # (R,2) px
     d = (xy - centre) / focal  # (R,2)
     d = F.normalize(F.pad(d, (0, 1), value=1.0))  # (R,3) in camera axes
     d = torch.einsum("rij,rj->ri", c2w[..., :3], d)  # (R,3) in world axes
     rgb = scene.rgb[scene.start[img] + pixel] / 255
     uv = xy / wh  # (R,2)
-    col, row = (uv * scene.static.shape[1]).long().T  # (R,) of the mask's pixel
+    col, row = (uv * scene.static.shape[1]).long().unbind(1)  # (R,) of the mask's pixel
     is_static = scene.static[img, row, col]
     return Rays(c2w[..., 3], d, scene.near[img, None], img, uv, rgb, is_static)
 
@@ -239,12 +239,12 @@ def uniform(gen, *shape):
 
 def random_index(gen, n, count):
     """Random numbers (count,) among 0 .. n - 1."""
-    return (uniform(gen, count) * n).long()
+    return torch.randint(n, (count,), generator=gen, device=gen.device)
 
 
 def random_rays(scene, img, gen, part=1.0):
     """Rays through random pixels of the photos img (R,), of the left `part` of each."""
-    w, h = scene.wh[img].T
+    w, h = scene.wh[img].unbind(1)
     u, v = uniform(gen, 2, len(img))
     col = (u * (part * w).long()).long()
     return make_rays(scene, img, (v * h).long() * w + col)
@@ -268,7 +268,8 @@ MAX_CELLS = 8_000_000  # of the foreground: about 1 GB with Adam's moments, more
 
 def corner_weights(f):
     """Trilinear weights (P,8) of a cell's corners at f (P,3), 0..1 within the cell."""
-    ends = torch.stack([1 - f.T, f.T], 1)  # (3,2,P)
+    f = f.t()  # (3,P)
+    ends = torch.stack([1 - f, f], 1)  # (3,2,P)
     return torch.einsum("ip,jp,kp->pijk", *ends).flatten(1).contiguous()
 
 
@@ -354,7 +355,7 @@ class Octree(nn.Module):
         key, number, cells_around = corners.unique(return_inverse=True, return_counts=True)
         is_whole = cells_around == 8  # (.,) has a feature
         row = (is_whole.cumsum(0) - 1).clamp_min(0)  # any row, where hanging
-        self.is_free = is_whole[number]  # (N,8)
+        self.is_hanging = ~is_whole[number]  # (N,8)
         self.corner = row[number].int()  # (N,8)
         key = key[is_whole]  # (V,)
         is_old = torch.isin(key, self.corner_key)
@@ -373,19 +374,19 @@ class Octree(nn.Module):
         octants = number_of(index & 1, 2)  # (P,L)
         node = number_of(index[:, 0], self.root)  # (P,) of level 0
         nodes = [node]
-        for octant in octants.T[1:]:  # (P,) of the levels after it
+        for octant in octants[:, 1:].unbind(1):  # (P,) of the levels after it
             child = self.child[node]  # (P,)
             node = torch.where(child > 0, child + octant, node)
             nodes.append(node)
-        return torch.column_stack(nodes), place.frac()
+        return torch.stack(nodes, 1), place.frac()
 
     def forward(self, x):
         """Features (...,LC) at x (...,3)."""
         node, place = self.locate(x.flatten(0, -2))  # of P points
-        exists = node.diff(prepend=node[:, :1] - 1) > 0  # (P,L) or a coarser cell's
+        is_missing = node.diff(prepend=node[:, :1] - 1) == 0  # (P,L) it is a coarser cell's
         node = node.flatten()  # (PL,)
-        w = corner_weights(place.flatten(0, 1))  # (PL,8)
-        w = w * self.is_free.index_select(0, node) * exists.reshape(-1, 1)
+        is_void = self.is_hanging.index_select(0, node) | is_missing.reshape(-1, 1)  # (PL,8)
+        w = corner_weights(place.flatten(0, 1)).masked_fill(is_void, 0)  # (PL,8)
         corner = self.corner.index_select(0, node)  # (PL,8)
         feat = WeightedSum.apply(self.features, corner, w)  # (PL,C)
         return feat.reshape(*x.shape[:-1], self.width)
@@ -502,13 +503,14 @@ class SDFField(nn.Module):
         """sdf (...) and geometry (...,G) at x (...,3)."""
         feat = self.octree(x)  # (...,LC)
         out = self.network(torch.cat([x, feat], -1))  # (...,1+GEO)
-        sdf = x.norm(dim=-1) - 0.25 + out[..., 0]  # (...)
-        return sdf, torch.cat([out[..., 1:], feat], -1)
+        more, geo = out.split([1, GEO], -1)
+        sdf = x.norm(dim=-1) - 0.25 + more.squeeze(-1)  # (...)
+        return sdf, torch.cat([geo, feat], -1)
 
     def derivatives(self, x, eps):
-        """grad s (P,3) and lap s (P,) at x (P,3), from s there and at four taps, eps away."""
+        """s (P,), grad s (P,3), lap s (P,) at x (P,3), from s there and at four taps, eps away."""
         sdf, _ = self(x[:, None] + eps * self.taps)  # (P,5) from (P,5,3)
-        return finite_differences(sdf, self.taps, eps)
+        return sdf[:, 0], *finite_differences(sdf, self.taps, eps)
 
 
 class LipschitzLinear(nn.Linear):
@@ -591,7 +593,7 @@ class SDFCache(nn.Module):
         _, n = jitter.shape
         u = (torch.arange(n, device=t0.device) + jitter) / n  # (R,S-1)
         inner = inverse_cdf(probes, weight + even + 1e-5, u)
-        return torch.hstack([t0, inner, t1])
+        return torch.cat([t0, inner, t1], 1)
 
 
 def contract(x):
@@ -621,25 +623,27 @@ class Background(nn.Module):
         before = rays.near.lerp(t0, place[:, :n] / n)  # (R,n)
         u = (place[:, n:] - n) / (S - n)  # (R,S-n)
         beyond = u / (1 - u).clamp_min(1e-3)
-        path = torch.hstack([before, t0 + beyond])  # (R,S) without the sphere, for lengths
-        t = torch.hstack([before, t1 + beyond])  # (R,S)
+        path = torch.cat([before, t0 + beyond], 1)  # (R,S) without the sphere, for lengths
+        t = torch.cat([before, t1 + beyond], 1)  # (R,S)
         x = contract(rays.at(t))  # (R,S,3)
         inputs = torch.cat([x, self.octree(x)], 2)  # (R,S,3+LC)
         out = mixed_precision(self.density, inputs)  # (R,S,1+GEO)
-        rgb = colors_of(self.color, out[..., 1:], per_ray)  # (R,S,3)
-        sigma = F.softplus(out[..., 0] - 1)  # (R,S)
+        sigma, geo = out.split([1, GEO], 2)
+        rgb = colors_of(self.color, geo, per_ray)  # (R,S,3)
+        sigma = F.softplus(sigma[..., 0] - 1)  # (R,S)
         alpha = 1 - torch.exp(-sigma[:, :-1] * path.diff())  # (R,S-1)
         w = composite(F.pad(alpha, (0, 1), value=1.0))  # (R,S)
         passes = 1 - w[:, :n].sum(1, keepdim=True)  # (R,1)
-        colors = w[..., None] * rgb  # (R,S,3)
-        return colors[:, :n].sum(1), passes, colors[:, n:].sum(1)
+        front, behind = (w[..., None] * rgb).split([n, S - n], 1)  # (R,n,3), (R,S-n,3)
+        return front.sum(1), passes, behind.sum(1)
 
 
-def render_rays(model, rays, code, jitter):
+def render_rays(model, rays, code, jitter, points):
     """One ray batch through the whole model, GeoNVS of section 7. code: (R,A) appearance; jitter in
-    0..1: S - 1 columns for the foreground, then the background's. Returns a dictionary: rgb (R,3);
-    opacity (R,); depth (R,) and end (R,3), where the ray ends on average, both without gradient;
-    normal (R,3), times opacity, e_grad and e_curv (R,) at that end; t (R,S+1) of the samples."""
+    0..1: S - 1 columns for the foreground, then the background's; points: (N,3) further places of
+    derivatives. Returns a dictionary: rgb (R,3); opacity (R,); depth (R,) and end (R,3), where the
+    ray ends on average, both without gradient; normal (R,3), times opacity, and e_curv (R,) at that
+    end; e_grad (R+N,) at ends and points; sdf (N,) at points."""
     zeta = model.zeta()
     inner, outer = jitter.tensor_split([model.cfg.samples - 1], 1)
     t0, t1 = sphere_interval(rays)  # (R,1)
@@ -652,11 +656,13 @@ def render_rays(model, rays, code, jitter):
     opacity = 1 - trans
     depth = ((w * t).sum(1) + trans * t1[:, 0]).detach()  # (R,) if it hits nothing: where it leaves
     end = rays.at(depth[:, None])[:, 0]  # (R,3)
-    grad, lap = model.sdf.derivatives(end, model.eps)  # (R,3), (R,) [D13]
-    normal = F.normalize(grad)
+    R = len(end)
+    places = torch.cat([end, points])  # (R+N,3), as one lookup is faster than two
+    s, grad, lap = model.sdf.derivatives(places, model.eps)  # (R+N,), (R+N,3), (R+N,) [D13]
+    normal = F.normalize(grad[:R])
 
-    per_ray = torch.hstack([rays.d, code])  # (R,3+A)
-    rgb = colors_of(model.color, geo, torch.hstack([normal, per_ray]))  # (R,S+1,3) [D13]
+    per_ray = torch.cat([rays.d, code], 1)  # (R,3+A)
+    rgb = colors_of(model.color, geo, torch.cat([normal, per_ray], 1))  # (R,S+1,3) [D13]
     rgb = torch.einsum("rs,rsc->rc", w, rgb)  # (R,3)
     behind = model.bg_color  # (3,)
     if model.background:
@@ -669,8 +675,8 @@ def render_rays(model, rays, code, jitter):
         end=end,
         normal=normal * opacity[:, None],  # 0 where nothing is
         e_grad=eikonal(grad),
-        e_curv=lap.abs() * model.eps * opacity.detach(),  # [D3] [D4]
-        t=t)
+        e_curv=lap[:R].abs() * model.eps * opacity.detach(),  # [D3] [D4]
+        sdf=s[R:])
 
 
 # ---- 6 Photos in the wild: transient mask and geometry preservation ------------------------------
@@ -684,21 +690,18 @@ def conv(inputs, outputs, stride):
 
 class ContextBlock(nn.Module):
     """Context-guided block (CGNet Fig. 3), from n channels to 2n at half the resolution: local and
-    dilated context, gated globally; no residual, no 1x1. [D6]"""
+    dilated context; no global gate, no residual, no 1x1. [D6]"""
     def __init__(self, n, dilation):
         super().__init__()
         self.reduce = conv(n, n, stride=2)
         self.local = nn.Conv2d(n, n, 3, padding=1, groups=n)
         self.around = nn.Conv2d(n, n, 3, padding=dilation, dilation=dilation, groups=n)
         self.norm = nn.GroupNorm(8, 2 * n)
-        self.gate = mlp(2 * n, n // 4, 2 * n)
 
     def forward(self, x):
         y = self.reduce(x)  # (B,n,h/2,w/2)
-        y = torch.hstack([self.local(y), self.around(y)])
-        y = F.relu(self.norm(y))  # (B,2n,h/2,w/2)
-        gate = self.gate(y.mean((2, 3))).sigmoid()  # (B,2n)
-        return y * gate[..., None, None]
+        y = torch.cat([self.local(y), self.around(y)], 1)
+        return F.relu(self.norm(y))  # (B,2n,h/2,w/2)
 
 
 def sample_logits(logits, uv):
@@ -863,11 +866,13 @@ class GeoNVS(nn.Module):
         R = len(rays.o)
         code = self.appearance(photos).repeat_interleave(R // len(photos), 0)  # (R,A)
         jitter = uniform(gen, R, self.draws)
-        out = render_rays(self, rays, code, jitter)
+        sfm = self.sfm[random_index(gen, len(self.sfm), R // 4)]  # (N,3)
+        near_sfm = sfm + 0.2 * uniform(gen, *sfm.shape) - 0.1  # (N,3)
+        out = render_rays(self, rays, code, jitter, torch.cat([sfm, near_sfm]))
         residual = (out["rgb"] - rays.rgb).abs()  # (R,3)
 
         error = residual.detach().amax(1)  # (R,) of the worst channel
-        richness = complexity(out["e_grad"], out["e_curv"])  # (R,)
+        richness = complexity(out["e_grad"][:R], out["e_curv"])  # (R,)
         phi = self.mask.phi(richness, out["opacity"]).detach()  # (R,)
         mask = torch.zeros_like(error)
         l_mask = 0.0
@@ -880,20 +885,15 @@ class GeoNVS(nn.Module):
                 l_mask = transient_loss(logit, excess)
             mask = reject_outliers(mask, excess > 0, done)
 
-        which = random_index(gen, cfg.samples + 1, R)
-        t = out["t"].gather(1, which[:, None])  # (R,1)
-        sample = rays.at(t)[::2, 0]  # (N,3) a random one of every second ray [D13]
-        sfm = self.sfm[random_index(gen, len(self.sfm), len(sample))]  # (N,3)
-        grad, _ = self.sdf.derivatives(sample, self.eps)  # (N,3)
         pull = self.zeta().detach().clamp_max(40)  # [D10]
 
         terms = dict(
             mse=residual.square().mean(),  # for the log
             rgb=((1 - mask) * residual.mean(1)).mean(),
-            eik=(out["e_grad"].mean() + eikonal(grad).mean()) / 2,
+            eik=out["e_grad"].mean(),  # at ends, at SfM points and near them [D13]
             curv=out["e_curv"].mean(),  # [D4]
             lps=lipschitz_loss(self.color),
-            sfm=pull * self.distance(sfm).abs().mean(),
+            sfm=pull * out["sdf"][:len(sfm)].abs().mean(),
             mask=mask.mean(),  # for the log, like gpl: rejected rays count as 1
             gpl=gpl_loss(mask, phi))
         total = (
@@ -925,7 +925,7 @@ class GeoNVS(nn.Module):
         follow_quantiles(mask.sfm_error, 0.75, out["error"], rays.is_static)
         pixel = out["depth"] / self.scene.K[rays.img, 0]  # (R,) its size at the ray's end
         error = (1 - out["mask"]) * out["error"]
-        columns = torch.column_stack([error * is_solid, pixel * is_solid, is_solid])  # (R,3)
+        columns = torch.stack([error * is_solid, pixel * is_solid, is_solid], 1)  # (R,3)
         octree = self.sdf.octree
         node, _ = octree.locate(out["end"])
         octree.record.index_add_(0, node[:, -1], columns)
@@ -973,7 +973,8 @@ class GeoNVS(nn.Module):
 
     def render(self, rays, code):
         """render_rays without jitter, for pictures and for fitting codes."""
-        return render_rays(self, rays, code, code.new_full((len(code), self.draws), 0.5))
+        jitter = code.new_full((len(code), self.draws), 0.5)
+        return render_rays(self, rays, code, jitter, rays.o[:0])
 
 
 # ---- 8 Energy ------------------------------------------------------------------------------------
@@ -1292,7 +1293,7 @@ def toy_truth(model, scene):
     near, sdf, wall, normal = [
         torch.as_tensor(raw[name]).to(scene.c2w)
         for name in ("near_wall", "near_wall_sdf", "wall", "wall_normal")]
-    grad, _ = model.sdf.derivatives(wall, 0.004)
+    _, grad, _ = model.sdf.derivatives(wall, 0.004)
     cos = F.cosine_similarity(grad, normal).clamp(-1, 1)
     truth = dict(
         sdf_error=(model.distance(near) - sdf).abs().mean().item(),

@@ -1483,7 +1483,7 @@ def test_seeding_leaves_no_hanging_corner_around_points():
     geonvs.seed_octree(octree, points, dense=1)
     node, _ = octree.locate(points)
     assert (octree.cells[node, 0] == torch.arange(4)).all()
-    assert octree.is_free[node].all()
+    assert not octree.is_hanging[node].any()
     assert 0.005 < octree.features.std() < 0.02
 
 
@@ -1628,6 +1628,14 @@ def plain_background(model, o, d, near, t0, t1, per_ray, jitter):
     return w[:n] @ colors[:n], 1 - w[:n].sum(), w[n:] @ colors[n:]
 
 
+def plain_derivatives(model, x):
+    """s, its gradient (3,) and what the mean of four taps around x (3,) differs from s by."""
+    taps = torch.tensor(geonvs.TAPS)
+    s = torch.stack([plain_sdf(model, x + model.eps * tap)[0] for tap in taps])
+    grad = 3 / 4 * s @ taps / model.eps
+    return s[0], grad, s[1:].mean() - s[0]
+
+
 def plain_render(model, o, d, near, t, code, jitter):
     """What render_rays returns for one ray, in one row, sample by sample."""
     zeta = torch.exp(10 * model.v)
@@ -1640,10 +1648,7 @@ def plain_render(model, o, d, near, t, code, jitter):
     depth = depth.detach()
     end = o + depth * d
 
-    taps = torch.tensor(geonvs.TAPS)
-    s = torch.stack([plain_sdf(model, end + model.eps * tap)[0] for tap in taps])
-    grad = 3 / 4 * s @ taps / model.eps
-    rise = s[1:].mean() - s[0]
+    _, grad, rise = plain_derivatives(model, end)
     e_grad = (grad.norm() - 1) ** 2
     e_curv = 6 * rise.abs() / model.eps * opacity.detach()
 
@@ -1658,7 +1663,7 @@ def plain_render(model, o, d, near, t, code, jitter):
             model, o, d, near, t[0], t[-1], per_ray, jitter)
         rgb = front + passes * rgb
     rgb = rgb + (1 - opacity) * behind
-    return torch.hstack([rgb, opacity, depth, end, opacity * normal, e_grad, e_curv, t])
+    return torch.hstack([rgb, opacity, depth, end, opacity * normal, e_curv, e_grad])
 
 
 def rough_case(**changes):
@@ -1690,9 +1695,17 @@ def test_rendering_and_its_gradients_equal_plain_loops(double, background):
     ends = geonvs.sphere_interval(rays)
     t = model.cache.distances(rays, *ends, inner, model.zeta()).detach()
     rows = zip(rays.o, rays.d, rays.near[:, 0], t, code, outer)
-    wanted = torch.stack([plain_render(model, *row) for row in rows])
-    out = geonvs.render_rays(model, rays, code, jitter)
-    assert_one_function(model, torch.column_stack(list(out.values())), wanted)
+    wanted = [plain_render(model, *row) for row in rows]
+    points = random(5, 3, low=-1)
+    for point in points:
+        s, grad, _ = plain_derivatives(model, point)
+        wanted.append(torch.stack([s, (grad.norm() - 1) ** 2]))
+    out = geonvs.render_rays(model, rays, code, jitter, points)
+    e_grad, points_e_grad = out.pop("e_grad").split([8, 5])
+    at_points = torch.stack([out.pop("sdf"), points_e_grad], 1)
+    per_ray = torch.column_stack([*out.values(), e_grad])
+    found = torch.cat([per_ray.flatten(), at_points.flatten()])
+    assert_one_function(model, found, torch.cat(wanted))
 
 
 # ---- 6 photos in the wild ------------------------------------------------------------------------
@@ -1777,9 +1790,10 @@ def plain_losses(model, rays, done):
     cfg = model.cfg
     gen = generator()
     jitter = geonvs.uniform(gen, 8, 10)
-    which = (geonvs.uniform(gen, 8) * 6).long()
-    sfm = (geonvs.uniform(gen, 4) * len(model.sfm)).long()
-    out = geonvs.render_rays(model, rays, model.appearance(rays.img), jitter)
+    sfm = model.sfm[torch.randint(len(model.sfm), (2,), generator=gen)]
+    near_sfm = sfm + 0.1 * (2 * geonvs.uniform(gen, 2, 3) - 1)
+    points = torch.cat([sfm, near_sfm])
+    out = geonvs.render_rays(model, rays, model.appearance(rays.img), jitter, points)
     p50, p75, p95 = model.mask.richness.tolist()
     price = max(0.15, cfg.lam_mask + model.mask.sfm_error.item())
     pull = min(40, model.zeta().item())
@@ -1806,16 +1820,15 @@ def plain_losses(model, rays, done):
                 M = 1.0
         terms["mse"] += residual.square().mean() / 8
         terms["rgb"] += (1 - M) * residual.mean() / 8
-        terms["eik"] += e_grad / 2 / 8
-        if r % 2 == 0:
-            x = rays.at(out["t"])[[r], which[r]]
-            grad, _ = model.sdf.derivatives(x, model.eps)
-            terms["eik"] += (grad.norm() - 1) ** 2 / 2 / 4
+        terms["eik"] += e_grad / 12
         terms["curv"] += e_curv / 8
         terms["mask"] += M / 8
         terms["gpl"] += M * phi / 8
     terms["lps"] = sum(layer.c for layer in model.color[::2])
-    terms["sfm"] = pull * model.distance(model.sfm[sfm]).abs().mean()
+    for point in points:
+        _, grad, _ = plain_derivatives(model, point)
+        terms["eik"] += (grad.norm() - 1) ** 2 / 12
+    terms["sfm"] = pull * model.distance(sfm).abs().mean()
     return terms
 
 
@@ -3334,6 +3347,7 @@ PIECES = {
             reject_outliers=keep_outliers)),
     "outliers kept": Row(replaced=dict(reject_outliers=keep_outliers)),
     "no SfM term": Row(dict(lam_sfm=0.0)),
+    "no eikonal": Row(dict(lam_eik=0.0)),
     "no curvature": Row(dict(lam_curv=0.0)),
     "no appearance": Row(dict(appearance="off")),
     "no background": Row(dict(background="off")),
