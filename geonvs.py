@@ -866,8 +866,8 @@ class GeoNVS(nn.Module):
         R = len(rays.o)
         code = self.appearance(photos).repeat_interleave(R // len(photos), 0)  # (R,A)
         jitter = uniform(gen, R, self.draws)
-        sfm = self.sfm[random_index(gen, len(self.sfm), R // 4)]  # (N,3)
-        near_sfm = sfm + 0.2 * uniform(gen, *sfm.shape) - 0.1  # (N,3)
+        sfm = self.sfm[random_index(gen, len(self.sfm), math.ceil(R / 4))]  # (N,3)
+        near_sfm = sfm + 0.2 * uniform(gen, *sfm.shape) - 0.1  # (N,3) in cubes around them
         out = render_rays(self, rays, code, jitter, torch.cat([sfm, near_sfm]))
         residual = (out["rgb"] - rays.rgb).abs()  # (R,3)
 

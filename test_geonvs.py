@@ -1865,6 +1865,12 @@ def test_a_step_is_finite_whatever_the_sdf_and_its_sharpness(warm, distance, zet
         assert grad.isfinite().all()
 
 
+def test_a_step_of_one_ray_is_finite(warm):
+    warm.cfg.photos = 1
+    total, _, _ = warm.losses(*make_batch(warm, 1), 0, generator())
+    assert total.isfinite()
+
+
 @pytest.mark.parametrize("setting", ["auto", "on", "off"])
 @pytest.mark.parametrize("spread, blue", [(0.009, 0.6), (0.011, math.nan)])
 def test_codes_and_background_follow_the_scene_unless_they_are_set(scene, setting, spread, blue):
