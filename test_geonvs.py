@@ -1708,6 +1708,14 @@ def test_rendering_and_its_gradients_equal_plain_loops(double, background):
     assert_one_function(model, found, torch.cat(wanted))
 
 
+def test_pictures_take_the_middle_of_every_stratum(warm):
+    rays, photos = make_batch(warm, 8)
+    code = warm.codes()[rays.img]
+    middle = torch.full((8, warm.draws), 0.5)
+    wanted = geonvs.render_rays(warm, rays, code, middle, rays.o)["rgb"]
+    close(warm.render(rays, code)["rgb"], wanted)
+
+
 # ---- 6 photos in the wild ------------------------------------------------------------------------
 
 def test_a_mask_is_half_as_large_as_its_photo_and_starts_low(warm):
