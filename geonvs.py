@@ -33,7 +33,7 @@ Departures from the printed paper; their tags stand in the code, or in the docst
   [D4]  the curvature loss is |lap| eps opacity, since |lap| of a trilinear field grows as eps
         shrinks; its weight is 0.01 (printed: lambda_curv = 2 stands in Eq. 4 and in Eq. 5)
   [D5]  the Lipschitz term is a sum of logs, not a product that can drown the colour at first
-  [D6]  CGNet is small and sees small square photos: one block a stage without gate, GroupNorm
+  [D6]  CGNet is small and sees small square photos: one plain block a stage, GroupNorm, ReLU
   [D7]  M is learnt by classification. A ray is transient if its error (of the worst channel)
         exceeds the price of masking it,
         max(upper quartile of errors at SfM pixels + lam_mask, 0.15) + lam_gpl Phi; a lesson weighs
@@ -690,18 +690,21 @@ def conv(inputs, outputs, stride):
 
 class ContextBlock(nn.Module):
     """Context-guided block (CGNet Fig. 3), from n channels to 2n at half the resolution: local and
-    dilated context; no global gate, no residual, no 1x1. [D6]"""
+    dilated context, gated globally; no residual, no 1x1. [D6]"""
     def __init__(self, n, dilation):
         super().__init__()
         self.reduce = conv(n, n, stride=2)
         self.local = nn.Conv2d(n, n, 3, padding=1, groups=n)
         self.around = nn.Conv2d(n, n, 3, padding=dilation, dilation=dilation, groups=n)
         self.norm = nn.GroupNorm(8, 2 * n)
+        self.gate = mlp(2 * n, n // 4, 2 * n)
 
     def forward(self, x):
         y = self.reduce(x)  # (B,n,h/2,w/2)
         y = torch.cat([self.local(y), self.around(y)], 1)
-        return F.relu(self.norm(y))  # (B,2n,h/2,w/2)
+        y = F.relu(self.norm(y))  # (B,2n,h/2,w/2)
+        gate = self.gate(y.mean((2, 3))).sigmoid()  # (B,2n)
+        return y * gate[..., None, None]
 
 
 def sample_logits(logits, uv):
