@@ -383,10 +383,11 @@ class Octree(nn.Module):
     def forward(self, x):
         """Features (...,LC) at x (...,3)."""
         node, place = self.locate(x.flatten(0, -2))  # of P points
-        is_missing = node.diff(prepend=node[:, :1] - 1) == 0  # (P,L) it is a coarser cell's
+        is_missing = node.diff(prepend=node[:, :1] - 1) == 0  # (P,L) node is coarser
         node = node.flatten()  # (PL,)
-        is_void = self.is_hanging.index_select(0, node) | is_missing.reshape(-1, 1)  # (PL,8)
-        w = corner_weights(place.flatten(0, 1)).masked_fill(is_void, 0)  # (PL,8)
+        is_hanging = self.is_hanging.index_select(0, node)  # (PL,8)
+        w = corner_weights(place.flatten(0, 1))  # (PL,8)
+        w = w.masked_fill(is_hanging | is_missing.reshape(-1, 1), 0)
         corner = self.corner.index_select(0, node)  # (PL,8)
         feat = WeightedSum.apply(self.features, corner, w)  # (PL,C)
         return feat.reshape(*x.shape[:-1], self.width)
@@ -503,8 +504,8 @@ class SDFField(nn.Module):
         """sdf (...) and geometry (...,G) at x (...,3)."""
         feat = self.octree(x)  # (...,LC)
         out = self.network(torch.cat([x, feat], -1))  # (...,1+GEO)
-        more, geo = out.split([1, GEO], -1)
-        sdf = x.norm(dim=-1) - 0.25 + more.squeeze(-1)  # (...)
+        offset, geo = out.split([1, GEO], -1)  # (...,1), (...,GEO)
+        sdf = x.norm(dim=-1) - 0.25 + offset.squeeze(-1)  # (...)
         return sdf, torch.cat([geo, feat], -1)
 
     def derivatives(self, x, eps):
@@ -634,7 +635,8 @@ class Background(nn.Module):
         alpha = 1 - torch.exp(-sigma[:, :-1] * path.diff())  # (R,S-1)
         w = composite(F.pad(alpha, (0, 1), value=1.0))  # (R,S)
         passes = 1 - w[:, :n].sum(1, keepdim=True)  # (R,1)
-        front, behind = (w[..., None] * rgb).split([n, S - n], 1)  # (R,n,3), (R,S-n,3)
+        colors = w[..., None] * rgb  # (R,S,3)
+        front, behind = colors.split([n, S - n], 1)
         return front.sum(1), passes, behind.sum(1)
 
 
