@@ -1,4 +1,4 @@
-"""Geo-NVS-w: a signed distance field, fed by tourist photos, becomes a picture from a new view.
+"""Geo-NVS-w: a signed distance field, trained on tourist photos, rendered from new viewpoints.
 
 A minimal single-file reference implementation of "Geo-NVS-w: Geometry-Aware Novel View Synthesis
 In-the-Wild with an SDF Renderer" (Tsalakopoulos et al., ICCV 2025 workshops). Sections 2 to 7
@@ -10,48 +10,35 @@ follow one ray from its pixel to the loss; the training loop comes after them.
     torchrun --nproc_per_node 4 geonvs.py  on 4 GPUs that share the rays of each step
     python geonvs.py --help                every setting with its meaning and default
 
+The paper's equations
+  Eq. 1  opacity of an interval     neus_alpha        Eq. 4  edge indicator Phi   edge_indicator
+  Eq. 2  compositing weights        composite         Eq. 5  objective            objective
+  Eq. 3  geometry preservation      gpl_loss
+
 Conventions
   world     the foreground is the unit sphere; x * scale + center leads back to SfM units
   cameras   c2w (3,4) camera to world, OpenCV axes: x right, y down, z forward; pixel centres +0.5
   rays      r(t) = o + t d with |d| = 1, so t is a distance along the ray and not a z-depth
   sdf       positive outside; the normal is the unit gradient; colours are sRGB in [0, 1]
-  mask      M = 1 means transient (person, car), M = 0 means scene
-  symbols   s signed distance, zeta sharpness of walls (1 / zeta is their width), eps length of the
-            taps of finite differences, lap the Laplacian, E_grad = (|grad s| - 1)^2, Phi edges
-  shapes    R rays, S sections of a ray (S + 1 samples), P points, N cells or what a line says, L
-            octree levels, C channels per level, V rows of features, G what colour is read
-            from, H, W height and width, A appearance dims, B photos of all I, K SfM points, T
-            sightings of them
+  mask      M = 1 means transient (person, car), M = 0 means static scene
+  symbols   s signed distance; zeta sharpness of the surface (1 / zeta is its width); eps step of
+            finite differences; lap Laplacian; E_grad = (|grad s| - 1)^2; E_curv = |lap s|
+  shapes    R rays, S intervals of a ray (S + 1 samples), P points, N as the line says, L octree
+            levels, C channels per level, V feature rows, G inputs of the colour network from
+            geometry, A appearance dims, B photos of all I, K SfM points, T their sightings
 
-Departures from the printed paper; their tags stand in the code, or in the docstring above it:
-  [D1]  alpha is divided by sigmoid(zeta s_i) and never negative (printed: a wall is 63 % opaque)
-  [D2]  alpha has no beta: s is evaluated at both ends of a section, so no slope has to be guessed;
-        a section has the mean colour of its ends
-  [D3]  Phi = opacity sigmoid((10 E_grad + 2 E_curv - centre) / width) at the ray's end, with
-        E_curv = |lap| eps opacity; centre and width follow quantiles over rays that end on the
-        foreground; no gradient
-  [D4]  the curvature loss is |lap| eps opacity, since |lap| of a trilinear field grows as eps
-        shrinks; its weight is 0.01 (printed: lambda_curv = 2 stands in Eq. 4 and in Eq. 5)
-  [D5]  the Lipschitz term is a sum of logs, not a product that can drown the colour at first
-  [D6]  CGNet is small and sees small square photos: one plain block a stage, GroupNorm, ReLU
-  [D7]  M is learnt by classification. A ray is transient if its error (of the worst channel)
-        exceeds the price of masking it,
-        max(upper quartile of errors at SfM pixels + lam_mask, 0.15) + lam_gpl Phi; a lesson weighs
-        as much as the two differ. There is no term for bimodality. M is taught in the first 60 %
-        of training; in the first 30 % a ray above its price that M suspects teaches no colours
-  [D8]  the background also fills what lies before the sphere; its last section is opaque
-  [D9]  only the colour and background networks have mixed precision: distances stay float32 (the
-        mask's convolutions may use TF32)
-  [D10] SfM points place the sphere, seed the octree, teach M = 0 and pull s(p) to zero, but less
-        while zeta is below 40: a strong pull would leave the surface fog. There is no off-surface
-        penalty, as trials were as good without, and no sphere loss: s starts as a small sphere
-  [D11] samples are drawn from a cached SDF volume; no second network pass along the ray
-  [D12] a test photo's code is fitted on its left half, its score is taken on the right half
-  [D13] derivatives are taken at the ray's end, at SfM points and near them, not at all samples,
-        which share the normal of the end in the colour network
-  [D14] zeta stays above a rising floor, so that no surface stays fog, and below a fixed bound
-  [D15] cells split where colours err, down to a pixel's size, and stay (the paper prunes empty
-        space); a scene that needs no codes, no mask or no background field is modelled without
+Departures from the printed paper; the tag stands at the code, with the reason
+  [D1]  Eq. 1 is divided by sigmoid(zeta s_i), and s is evaluated at both ends: no beta
+  [D2]  E_curv is |lap s| eps; the sigmoid of Eq. 4 is calibrated by running quantiles
+  [D3]  L_reg classifies pixels as transient by a threshold on their error; outliers are rejected
+  [D4]  L_lps is a sum of logarithms, not a product
+  [D5]  CGNet is reduced to three stages and reads small square photos
+  [D6]  the background field also renders what lies before the sphere
+  [D7]  SfM points place the sphere, seed the octree, pull s to zero and keep M at zero; they stand
+        for the off-surface penalty and the sphere loss
+  [D8]  samples follow a cached SDF; derivatives are taken at one surface point per ray
+  [D9]  zeta stays between a rising floor and a fixed bound
+  [D10] cells split where colours err and are never pruned; parts that a scene does not need are off
 """
 import argparse
 import inspect
@@ -80,7 +67,8 @@ from torch import Tensor, nn
 import data_prep
 from data_prep import UserError, atomic_write, check, progress
 
-torch.set_float32_matmul_precision("highest")  # [D9] no TF32 in products of matrices
+# distances need float32: TF32 would drown finite differences in rounding errors
+torch.set_float32_matmul_precision("highest")
 
 
 # ---- 1 Config: every field is a flag -------------------------------------------------------------
@@ -116,20 +104,21 @@ class Config:
     downscale: int = 2  # integer factor by which photos are made smaller (benchmarks use 2)
     rays: int = 512  # rays per step, of all processes together
     photos: int = 8  # photos per step, of each process; the mask network sees them whole
-    samples: int = 15  # sections S of a ray in the foreground, S + 1 samples
+    samples: int = 15  # intervals S of a ray in the foreground, S + 1 samples
     bg_samples: int = 24  # background samples per ray, a sixth of them before the sphere
     levels: int = 0  # octree levels, 0: from the pixel footprint at the surface
     hidden: int = 64  # width of the MLPs
     appearance_dim: int = 16  # length of a photo's appearance code
     appearance: str = "auto"  # codes; auto: on if exposures differ
-    mask: str = "auto"  # auto: off if it marks hardly anything
-    background: str = "auto"  # field; auto: off if it is one colour
-    lam_eik: float = 0.004  # weight of the eikonal loss (Permuto-SDF: 0.04)
-    lam_curv: float = 0.01  # weight of the curvature loss, on |lap| eps [D4]
-    lam_gpl: float = 0.05  # weight of the geometry-preservation loss (paper) [D7]
-    lam_lps: float = 1e-5  # weight of the Lipschitz loss, log form [D5]
-    lam_sfm: float = 7.5e-3  # weight of min(zeta, 40) |s(p)| at SfM points [D10]
-    lam_mask: float = 0.04  # error above that of SfM pixels that masks a ray [D7]
+    mask: str = "auto"  # transient mask; auto: off if it marks hardly anything
+    background: str = "auto"  # background field; auto: off if it is one colour
+    lam_eik: float = 0.004  # weight of L_eik, the eikonal loss (Permuto-SDF: 0.04)
+    lam_curv: float = 0.01  # weight of L_curv, the curvature loss, on |lap s| eps [D2]
+    lam_mask: float = 1.0  # weight of L_reg, which trains the mask [D3]
+    lam_gpl: float = 0.05  # weight of L_GPL, the geometry-preservation loss (paper)
+    lam_lps: float = 1e-5  # weight of L_lps, the Lipschitz loss, log form [D4]
+    lam_sfm: float = 7.5e-3  # weight of min(zeta, 40) |s(p)| at SfM points [D7]
+    mask_margin: float = 0.04  # error above that of SfM pixels that makes a pixel transient [D3]
     lr_grid: float = 1e-2  # learning rate of octree features
     lr_code: float = 3e-2  # learning rate of appearance codes
     lr_net: float = 4e-3  # learning rate of networks
@@ -150,7 +139,7 @@ class Config:
 
 
 # settings of photos on a GPU that differ from Config's defaults; flags override them
-LARGE = dict(
+GPU_DEFAULTS = dict(
     steps=300_000,
     rays=4096,
     photos=16,
@@ -169,17 +158,18 @@ class Scene(NamedTuple):
     c2w: Tensor  # (I,3,4)
     near: Tensor  # (I,) smallest useful t
     points: Tensor  # (K,3) SfM points
+    masked: Tensor  # (N,) whether a person's own mask leaves the pixel out; (0,) without masks
     thumbs: Tensor  # (I,3,n,n) uint8, whole photos for the mask network
-    static: Tensor  # (I,n/2,n/2) mask pixels that show SfM points; some wrongly, at outlines [D10]
-    train: Tensor  # (B,) numbers of the photos to train on
-    test: Tensor  # (B,) numbers of the held-out photos
+    static: Tensor  # (I,n/2,n/2) mask pixels that show SfM points; some wrongly, at outlines [D7]
+    train: Tensor  # (B,) indices of the training photos
+    test: Tensor  # (B,) indices of the held-out photos
     raw: dict  # the file in numpy: names, statistics, center, scale, ground truth of the toy
-    info: dict  # what the file was made from; a checkpoint fits only the same
+    info: dict  # what the file was made from
 
 
 def load_scene(raw, device="cpu"):
     """Scene from the dictionary of a scene file (data_prep.open_scene, make_toy or prepare)."""
-    side = int(np.clip(np.median(raw["wh"].max(1)) / 2, 64, 256))  # px, half the long side [D6]
+    side = int(np.clip(np.median(raw["wh"].max(1)) / 2, 64, 256))  # px, half the long side [D5]
     thumbs = [
         cv2.resize(pixels.reshape(h, w, 3), (side, side), interpolation=cv2.INTER_AREA)
         for pixels, (w, h) in zip(np.split(raw["rgb"], raw["start"][1:]), raw["wh"])]
@@ -190,6 +180,7 @@ def load_scene(raw, device="cpu"):
     static = np.zeros((len(thumbs), n, n), bool)
     static[raw["track_photo"][is_seen], row, col] = True
     arrays = [raw[key] for key in Scene._fields[:7]]
+    arrays.append(raw.get("masked", np.zeros(0, bool)))
     arrays += [np.moveaxis(thumbs, 3, 1), static]
     is_test = raw["is_test"]
     arrays += [np.flatnonzero(~is_test), np.flatnonzero(is_test)]
@@ -208,7 +199,8 @@ class Rays(NamedTuple):
     img: Tensor  # (R,) photo index
     uv: Tensor  # (R,2) pixel position over photo size, 0..1
     rgb: Tensor  # (R,3) the photo's colour
-    is_static: Tensor  # (R,) whether the mask's pixel shows an SfM point [D10]
+    is_static: Tensor  # (R,) whether the mask's pixel shows an SfM point [D7]
+    is_masked: Tensor  # (R,) whether a person's own mask leaves the pixel out
 
     def at(self, t):
         """Points (R,S,3) at distances t (R,S)."""
@@ -216,7 +208,7 @@ class Rays(NamedTuple):
 
 
 def make_rays(scene, img, pixel):
-    """Rays through pixels. img, pixel: (R,) photo, and row-major number in it."""
+    """Rays through pixels. img, pixel: (R,) photo, and row-major index in it."""
     wh = scene.wh[img]  # (R,2)
     w = wh[:, 0]
     focal, centre = scene.K[img].split(2, 1)  # (R,2)
@@ -225,11 +217,15 @@ def make_rays(scene, img, pixel):
     d = (xy - centre) / focal  # (R,2)
     d = F.normalize(F.pad(d, (0, 1), value=1.0))  # (R,3) in camera axes
     d = torch.einsum("rij,rj->ri", c2w[..., :3], d)  # (R,3) in world axes
-    rgb = scene.rgb[scene.start[img] + pixel] / 255
+    place = scene.start[img] + pixel  # (R,)
+    rgb = scene.rgb[place] / 255
     uv = xy / wh  # (R,2)
     col, row = (uv * scene.static.shape[1]).long().unbind(1)  # (R,) of the mask's pixel
     is_static = scene.static[img, row, col]
-    return Rays(c2w[..., 3], d, scene.near[img, None], img, uv, rgb, is_static)
+    is_masked = torch.zeros_like(is_static)
+    if len(scene.masked):
+        is_masked = scene.masked[place]
+    return Rays(c2w[..., 3], d, scene.near[img, None], img, uv, rgb, is_static, is_masked)
 
 
 def uniform(gen, *shape):
@@ -238,7 +234,7 @@ def uniform(gen, *shape):
 
 
 def random_index(gen, n, count):
-    """Random numbers (count,) among 0 .. n - 1."""
+    """Random integers (count,) among 0 .. n - 1."""
     return torch.randint(n, (count,), generator=gen, device=gen.device)
 
 
@@ -264,10 +260,11 @@ def sphere_interval(rays):
 
 ROOT = 16  # cells of the coarsest level along an axis
 MAX_CELLS = 8_000_000  # of the foreground: about 1 GB with Adam's moments, more while refining
+SPLIT_SHARE = 0.8  # of the recorded error lies in the cells that a refinement splits
 
 
-def corner_weights(f):
-    """Trilinear weights (P,8) of a cell's corners at f (P,3), 0..1 within the cell."""
+def trilinear_weights(f):
+    """Weights (P,8) of a cell's corners at f (P,3), 0..1 within the cell."""
     f = f.t()  # (3,P)
     ends = torch.stack([1 - f, f], 1)  # (3,2,P)
     return torch.einsum("ip,jp,kp->pijk", *ends).flatten(1).contiguous()
@@ -291,109 +288,120 @@ class WeightedSum(torch.autograd.Function):
         return out, None, None
 
 
-def grid_index(n, like):
-    """All cells (n^3,4) of level 0 with indices below n, the last one fastest, beside `like`."""
-    return like.new_ones(1, n, n, n).nonzero()
+def grid_index(n, device):
+    """Indices (n^3,3) of all cells of a grid with n cells along an axis, the last axis fastest."""
+    line = torch.arange(n, device=device)
+    return torch.cartesian_prod(line, line, line)
 
 
-def number_of(index, n=2**13):
-    """One number (...) for integers (...,d), each below n: its digits, the largest place first. For
-    a cell or corner (level, i, j, k) it is the key."""
-    number, *digits = index.unbind(-1)
-    for digit in digits:
-        number = torch.add(digit, number, alpha=n)  # digit + n number
-    return number
+def pack_index(index, base=2**13):
+    """An index of integers (...,d), each below base, as one integer (...). For a cell or corner
+    (level, i, j, k) it is the key that the octree finds it by."""
+    key = index[..., 0]
+    for digit in index[..., 1:].unbind(-1):
+        key = torch.add(digit, key, alpha=base)  # digit + base key
+    return key
 
 
 class Octree(nn.Module):
     """Feature grid over the cube [-half, half]^3 that is fine only where it has been split. Level
     0 is a dense grid of root^3 cells. Features live on corners, shared by the cells that meet
     there. A corner that lacks one of its eight cells ("hanging") has the weight 0, so the field is
-    continuous across borders of refined regions, and 0 on the cube's faces. At a place where a
-    level has no cell, the features of that level are 0."""
+    continuous across borders of refined regions, and 0 on the cube's faces. Where a level has no
+    cell, the features of that level are 0."""
     def __init__(self, half, levels, channels=4, root=ROOT):
         super().__init__()
         self.half = half
         self.levels = levels
         self.width = levels * channels  # LC
         self.root = root
+        resolution = root * 2.0 ** torch.arange(levels)
+        self.resolution = nn.Buffer(resolution, persistent=False)  # (L,) cells along an axis
         self.features = torch.zeros(0, channels)  # (V,C), none at first; build adds parameters
         self.corner_key = torch.arange(0)  # (V,) sorted, the corner of each row
-        self.resolution = root * 2.0 ** torch.arange(levels)  # (L,) cells along an axis
-        self.side = 2 * half / self.resolution  # (L,) of a cell, scene units
         self.build(self.corner_key)  # no cell is split
 
+    @property
+    def side(self):
+        """(L,) side of a cell, scene units."""
+        return 2 * self.half / self.resolution
+
     def split(self, cells):
-        """Splits cells (...,4); the function stays, as new features are zero. See build."""
-        return self.build(torch.cat([self.split_keys, number_of(cells).flatten()]).unique())
+        """Splits cells (...,4), but for those of the last level. The function stays, as new
+        features are zero. See build."""
+        cells = cells.reshape(-1, 4)
+        key = pack_index(cells[cells[:, 0] < self.levels - 1])
+        return self.build(torch.cat([self.split_keys, key]).unique())
 
     def build(self, split_keys):
-        """Makes cells and corners from the keys of the cells that are split, all that were split
-        before among them. New features are zero. Returns which rows (V,) are old, in old order."""
-        self.split_keys = split_keys
-        octants = grid_index(2, split_keys)  # (8,4)
-        cells = grid_index(self.root, split_keys)  # (N,4)
-        levels = []
-        splits = []
+        """Makes cells and corners, given the keys of all cells that are split. Rows of corners that
+        were there before keep their features, new ones are zero. Returns which rows (V,) are old;
+        they keep their order."""
+        device = split_keys.device
+        octants = grid_index(2, device)  # (8,3)
+        index = grid_index(self.root, device)  # (N,3) cells of a level
+        cells = []
+        is_split = []
         for level in range(self.levels):
-            cells[:, 0] = level
-            is_split = torch.isin(number_of(cells), split_keys)  # (N,)
-            is_split &= level < self.levels - 1
-            levels.append(cells)
-            splits.append(is_split)
-            children = 2 * cells[is_split, None] + octants  # (N,8,4) but for the level
-            cells = children.flatten(0, 1)
-        self.cells = torch.cat(levels)  # (N,4) level, i, j, k
-        self.finest = self.side[self.cells[-1, 0]].item()  # side of the smallest cell
-        is_split = torch.cat(splits)
-        first = self.root**3 + 8 * (is_split.cumsum(0) - 1)  # (N,) children follow each other
-        self.child = (first * is_split).int()  # (N,) 0: none
-        # (N,3) of rays that end in a cell, sums of: error, size of a pixel there, 1
-        self.record = nn.Buffer(self.features.new_zeros(len(first), 3))
-
-        corners = number_of(self.cells[:, None] + octants)  # (N,8) keys
-        key, number, cells_around = corners.unique(return_inverse=True, return_counts=True)
-        is_whole = cells_around == 8  # (.,) has a feature
-        row = (is_whole.cumsum(0) - 1).clamp_min(0)  # any row, where hanging
-        self.is_hanging = ~is_whole[number]  # (N,8)
-        self.corner = row[number].int()  # (N,8)
-        key = key[is_whole]  # (V,)
+            cells.append(F.pad(index, (1, 0), value=level))  # (N,4) level, i, j, k
+            is_split.append(torch.isin(pack_index(cells[level]), split_keys))  # (N,)
+            parents = index[is_split[level]]
+            index = (2 * parents[:, None] + octants).flatten(0, 1)  # eight children follow each
+        cells = torch.cat(cells)
+        is_split = torch.cat(is_split)
+        first_child = self.root**3 + 8 * (is_split.cumsum(0) - 1)  # (N,)
+        corners = pack_index(cells[:, None] + F.pad(octants, (1, 0)))  # (N,8) keys
+        key, corner, cells_around = corners.unique(return_inverse=True, return_counts=True)
+        has_feature = cells_around == 8
+        row = (has_feature.cumsum(0) - 1).clamp_min(0)  # of a corner's feature; any, where hanging
+        key = key[has_feature]  # (V,)
         is_old = torch.isin(key, self.corner_key)
+
+        self.split_keys = split_keys
         self.corner_key = key
-        self.features = nn.Parameter(place_rows(self.features, is_old))
+        self.features = nn.Parameter(carry_over_rows(self.features, is_old))
+        self.cells = nn.Buffer(cells, persistent=False)
+        self.child = nn.Buffer((first_child * is_split).int(), persistent=False)  # (N,) 0: none
+        self.corner = nn.Buffer(row[corner].int(), persistent=False)  # (N,8) rows
+        self.is_hanging = nn.Buffer(~has_feature[corner], persistent=False)  # (N,8)
+        # (N,3) of rays that end in a cell, sums of: error, size of a pixel there, 1
+        self.cell_error = nn.Buffer(self.features.new_zeros(len(cells), 3))
+        self.finest = 2 * self.half / (self.root * 2 ** cells[-1, 0].item())  # smallest cell's side
         return is_old
 
     def locate(self, x):
         """For x (P,3) and each level: the row in cells of the finest cell around x down to that
-        level (P,L); the place in a cell of the level, 0..1 (P,L,3). An x outside the cube is moved
-        to its border."""
+        level (P,L); whether that level has a cell there (P,L); the place in it, 0..1 (P,L,3). An x
+        outside the cube is moved to its border."""
         place = 0.5 + x * (0.5 / self.half)  # (P,3) over the cube
         place = place.clamp(0, 1 - 1e-6).nan_to_num()  # a diverging run ends at its next log line
         place = place[:, None] * self.resolution[:, None]  # (P,L,3) in cells
         index = place.long()  # (P,L,3)
-        octants = number_of(index & 1, 2)  # (P,L)
-        node = number_of(index[:, 0], self.root)  # (P,) of level 0
+        octants = pack_index(index & 1, base=2)  # (P,L)
+        node = pack_index(index[:, 0], base=self.root)  # (P,) of level 0
         nodes = [node]
+        exists = [torch.ones_like(node, dtype=torch.bool)]
         for octant in octants[:, 1:].unbind(1):  # (P,) of the levels after it
             child = self.child[node]  # (P,)
-            node = torch.where(child > 0, child + octant, node)
+            has_child = child > 0
+            node = torch.where(has_child, child + octant, node)
             nodes.append(node)
-        return torch.stack(nodes, 1), place.frac()
+            exists.append(has_child)
+        return torch.stack(nodes, 1), torch.stack(exists, 1), place.frac()
 
     def forward(self, x):
         """Features (...,LC) at x (...,3)."""
-        node, place = self.locate(x.flatten(0, -2))  # of P points
-        is_missing = node.diff(prepend=node[:, :1] - 1) == 0  # (P,L) node is coarser
+        node, exists, place = self.locate(x.flatten(0, -2))  # of P points
         node = node.flatten()  # (PL,)
         is_hanging = self.is_hanging.index_select(0, node)  # (PL,8)
-        w = corner_weights(place.flatten(0, 1))  # (PL,8)
-        w = w.masked_fill(is_hanging | is_missing.reshape(-1, 1), 0)
+        w = trilinear_weights(place.flatten(0, 1))  # (PL,8)
+        w = w.masked_fill(is_hanging | ~exists.reshape(-1, 1), 0)
         corner = self.corner.index_select(0, node)  # (PL,8)
         feat = WeightedSum.apply(self.features, corner, w)  # (PL,C)
         return feat.reshape(*x.shape[:-1], self.width)
 
 
-def place_rows(table, is_old):
+def carry_over_rows(table, is_old):
     """A table (V,C) with the rows of table (.,C) where is_old (V,), zeros elsewhere."""
     out = table.new_zeros(len(is_old), table.shape[1])
     out[is_old] = table
@@ -409,40 +417,41 @@ def in_chunks(function, x):
 def seed_octree(octree, points, dense):
     """Splits the first `dense` levels everywhere, two more, if there are as many, around points
     (P,3), neighbours too, so that no corner of a point's cell is hanging; then random features.
-    [D10]"""
+    [D7]"""
     for _ in range(dense):
         octree.split(octree.cells)
-    neighbours = grid_index(3, points)  # (27,4)
-    neighbours[:, 1:] -= 1
+    neighbours = F.pad(grid_index(3, points.device) - 1, (1, 0))  # (27,4)
     for _ in range(2):
-        node, _ = octree.locate(points)
+        node, _, _ = octree.locate(points)
         home = octree.cells[node[:, -1].unique()]  # (N,4)
         octree.split(home[:, None] + neighbours)
     nn.init.normal_(octree.features, std=0.01)
 
 
-def worst_cells(octree):
-    """The cells (N,4) that should be split: the worst, with 80 % of the error that is recorded in
-    cells whose children are no finer than a pixel. Rays end in cells that are not split. [D15]"""
+def cells_to_split(octree):
+    """The cells (N,4) with the largest errors: together SPLIT_SHARE of what is recorded in cells
+    whose children are no finer than a pixel. Rays end in cells that are not split. [D10]"""
     level = octree.cells[:, 0]  # (N,)
-    error, pixel, count = octree.record.T  # (N,) sums over rays
+    error, pixel, count = octree.cell_error.T  # (N,) sums over rays
     is_coarse = pixel < count * octree.side[level] / 2  # mean size of a pixel under a child's side
     can_split = is_coarse & (level < octree.levels - 1)
     found, worst = (error * can_split).sort(descending=True)  # (N,)
-    before = found.cumsum(0) - found  # (N,) what worse cells hold
-    is_chosen = before < 0.8 * found.sum()
+    error_before = found.cumsum(0) - found  # (N,) in worse cells
+    is_chosen = error_before < SPLIT_SHARE * found.sum()
     room = (MAX_CELLS - len(level)) // 8  # seeding leaves most of it
     return octree.cells[worst[is_chosen][:room]]
 
 
 # ---- 4 Fields: the networks on top of the octree -------------------------------------------------
 
-GEO = 15  # length of the geometry feature that the SDF network hands to the colour network
-MIXED_ON = "cuda"  # where colour and background networks run in bfloat16 [D9]
+GEOMETRY_FEATURES = 15  # that the SDF network hands to the colour network
+START_RADIUS = 0.25  # of the sphere that s starts as; it grows to the landmark [D7]
+MIXED_ON = "cuda"  # where colour and background networks run in bfloat16
 
 
 def mixed_precision(network, x):
-    """network(x), computed in bfloat16 where that pays, returned as float32. [D9]"""
+    """network(x), computed in bfloat16 where that pays, returned as float32. Not for distances:
+    finite differences need float32."""
     if x.device.type != MIXED_ON:
         return network(x)
     with torch.autocast(MIXED_ON, torch.bfloat16):
@@ -465,18 +474,17 @@ def colors_of(network, geo, per_ray):
     return mixed_precision(network, inputs).sigmoid()
 
 
-UNIT = 3**-0.5
-TAPS = (  # a point and, at a distance of 1, the corners of a tetrahedron
-    (0.0, 0.0, 0.0),
-    (UNIT, UNIT, UNIT),
-    (UNIT, -UNIT, -UNIT),
-    (-UNIT, UNIT, -UNIT),
-    (-UNIT, -UNIT, UNIT))
+TETRAHEDRON = torch.tensor([  # a point and, at a distance of 1, the corners around it
+    [0.0, 0.0, 0.0],
+    [1.0, 1.0, 1.0],
+    [1.0, -1.0, -1.0],
+    [-1.0, 1.0, -1.0],
+    [-1.0, -1.0, 1.0]]) / 3**0.5  # (5,3)
 
 
 def finite_differences(s, taps, eps):
-    """Gradient (P,3) and Laplacian (P,) of a field from its values s (P,5) at x + eps taps: x
-    itself, then the corners of a regular tetrahedron (Neuralangelo's code; its paper has six)."""
+    """Gradient (P,3) and Laplacian (P,) of a field from its values s (P,5) at x + eps taps, taps
+    being TETRAHEDRON (Neuralangelo's code; its paper has six)."""
     grad = 3 / (4 * eps) * (s @ taps)  # (P,3) as the sum of k k^T over corners k is 4/3 I
     lap = 6 / eps**2 * (s[:, 1:].mean(1) - s[:, 0])
     return grad, lap
@@ -488,24 +496,24 @@ def eikonal(grad):
 
 
 class SDFField(nn.Module):
-    """s(x) and what colour is read from: a geometry feature beside the octree's own features. One
-    hidden layer over xyz and features; G = GEO + L C. In float32 [D9]. The network learns what is
-    to be added to the distance from a small sphere, which grows to the landmark [D10]."""
+    """s(x) and the inputs of the colour network: a geometry feature beside the octree's features.
+    One hidden layer over xyz and features; G = GEOMETRY_FEATURES + L C. The network learns what is
+    to be added to the distance from a small sphere. In float32 on every device."""
     def __init__(self, octree, hidden):
         super().__init__()
         self.octree = octree
-        self.network = mlp(3 + octree.width, hidden, 1 + GEO)
+        self.network = mlp(3 + octree.width, hidden, 1 + GEOMETRY_FEATURES)
         last = self.network[2]
         nn.init.normal_(last.weight[0], std=0.01)
         nn.init.zeros_(last.bias)
-        self.taps = torch.tensor(TAPS)  # (5,3)
+        self.taps = nn.Buffer(TETRAHEDRON.to(last.bias.device), persistent=False)
 
     def forward(self, x):
         """sdf (...) and geometry (...,G) at x (...,3)."""
         feat = self.octree(x)  # (...,LC)
-        out = self.network(torch.cat([x, feat], -1))  # (...,1+GEO)
-        offset, geo = out.split([1, GEO], -1)  # (...,1), (...,GEO)
-        sdf = x.norm(dim=-1) - 0.25 + offset.squeeze(-1)  # (...)
+        out = self.network(torch.cat([x, feat], -1))  # (...,1+GEOMETRY_FEATURES)
+        offset, geo = out.split([1, GEOMETRY_FEATURES], -1)
+        sdf = x.norm(dim=-1) - START_RADIUS + offset.squeeze(-1)  # (...)
         return sdf, torch.cat([geo, feat], -1)
 
     def derivatives(self, x, eps):
@@ -527,25 +535,31 @@ class LipschitzLinear(nn.Linear):
 
 
 def lipschitz_loss(network):
-    """Log of the network's bound, the product of its layers'. [D5]"""
+    """L_lps: log of the network's bound, which is the product of its layers'. The product itself
+    would exceed L_rgb at first by far and stop the colours from being learnt. [D4]"""
     return sum(layer.c for layer in network[::2])
 
 
 # ---- 5 From SDF to colour: alpha, compositing, samples, background -------------------------------
 
+PROBES = 64  # intervals of a ray in which a cache is looked up, to place samples
+UNIFORM_SHARE = 0.25  # weight of evenly spread samples, so that a lost surface can return
+
+
 def neus_alpha(sdf, zeta):
-    """Opacity (R,S) of the sections between samples with SDF (R,S+1). Eq. 1, mended:
-    alpha_i = max(0, 1 - sigmoid(zeta s_{i+1}) / sigmoid(zeta s_i)) (NeuS Eq. 13) [D1] [D2]"""
+    """Opacity (R,S) of the intervals between samples with SDF (R,S+1). Eq. 1 corrected: alpha_i =
+    max(0, 1 - sigmoid(zeta s_{i+1}) / sigmoid(zeta s_i)), which is NeuS Eq. 13. As printed, without
+    the division, a surface is 63 % opaque; with s at both ends no slope beta is needed. [D1]"""
     log_phi = F.logsigmoid(zeta * sdf)  # (R,S+1), which does not overflow
     fall = log_phi.diff().clamp_max(0)  # (R,S) 0 where the ray leads outwards
     return -fall.expm1()
 
 
 def composite(alpha):
-    """Eq. 2: weights w_i = T_i alpha_i (R,S) with T_i = prod_{j<i} (1 - alpha_j). By a sum of logs,
-    in which an opaque section counts as passing 1e-6."""
-    log_passes = torch.log1p((1e-6 - 1) * alpha)  # (R,S) of what passes a section
-    trans = torch.exp(log_passes.cumsum(1) - log_passes)  # (R,S) T_i
+    """Eq. 2: weights w_i = T_i alpha_i (R,S) with T_i = prod_{j<i} (1 - alpha_j). As a sum of logs,
+    in which the transmittance of an opaque interval counts as 1e-6."""
+    log_pass = torch.log1p((1e-6 - 1) * alpha)  # (R,S) log transmittance of each interval
+    trans = torch.exp(log_pass.cumsum(1) - log_pass)  # (R,S) T_i
     return trans * alpha
 
 
@@ -561,40 +575,82 @@ def inverse_cdf(edges, weight, u):
     return edges.gather(1, left).lerp(edges.gather(1, right), part.clamp(0, 1))
 
 
-EVEN = 0.25  # weight of samples spread evenly, so that a lost surface can return: a fifth of all
+def stratified(jitter):
+    """Numbers (R,S) in 0..1, one in each of S equal strata, where jitter (R,S) in 0..1 says."""
+    _, S = jitter.shape
+    return (torch.arange(S, device=jitter.device) + jitter) / S
 
 
 class SDFCache(nn.Module):
-    """The SDF on a dense grid, up to 63 steps old: where along a ray samples pay. [D11]"""
+    """s, E_grad and E_curv on a dense grid, a little old: where along a ray samples pay [D8], and
+    how complex the geometry along it is (Eq. 4)."""
     def __init__(self, n):
         super().__init__()
         self.n = n
-        self.volume = nn.Buffer(torch.zeros(1, 1, n, n, n))  # x slowest
-        line = torch.linspace(-1, 1, n)
-        self.points = torch.cartesian_prod(line, line, line)  # (P,3)
+        self.volume = nn.Buffer(torch.zeros(1, 3, n, n, n))  # x slowest
+        radius = self.points(torch.arange(n**3)).norm(dim=1)
+        inside = (radius < 1 + 6 / n).nonzero()[:, 0]  # (N,) voxels in the sphere or next to it
+        self.inside = nn.Buffer(inside, persistent=False)
 
-    def refresh(self, sdf):
-        """Evaluates sdf, (P,3) to (P,), again."""
-        self.volume.view(-1)[:] = in_chunks(sdf, self.points)  # (P,)
+    def points(self, index):
+        """Places (P,3) of voxels (P,)."""
+        n = self.n
+        voxel = torch.stack([index // n**2, index // n % n, index % n], 1)
+        return voxel * (2 / (n - 1)) - 1
+
+    def refresh(self, sdf, share=1.0, turn=0):
+        """Evaluates sdf, (P,3) to (P,), again: at that share of the voxels in the sphere which is
+        nearest to the surface, and at an eighth of all, another one each turn."""
+        s = self.volume[0, 0].flatten()  # (n^3,)
+        distance = s[self.inside].abs()
+        near = distance.topk(int(share * len(distance)), largest=False, sorted=False).indices
+        for index in (self.inside[near], self.inside[turn % 8::8]):
+            s[index] = in_chunks(sdf, self.points(index))
+        s = s.view_as(self.volume[0, 0])
+        self.volume[0] = torch.stack([s, *central_differences(s)])
+
+    def lookup(self, x, channels):
+        """Values (.,R,N) of some channels at x (R,N,3), trilinear."""
+        grid = x.flip(-1)[None, None]  # (1,1,R,N,3), z first as grid_sample wants it
+        volume = self.volume[:, channels]
+        return F.grid_sample(volume, grid, padding_mode="border", align_corners=True)[0, :, 0]
 
     def sdf(self, x):
-        """s (R,N) at x (R,N,3), trilinear."""
-        grid = x.flip(-1)[None, None]  # (1,1,R,N,3), z first as grid_sample wants it
-        s = F.grid_sample(self.volume, grid, padding_mode="border", align_corners=True)
-        return s[0, 0, 0]
+        """s (R,N) at x (R,N,3)."""
+        return self.lookup(x, slice(0, 1))[0]
 
-    def distances(self, rays, t0, t1, jitter, zeta):
-        """Distances (R,S+1) of samples from t0 to t1 (R,1), dense where a surface is seen. jitter:
-        (R,S-1) in 0..1, stratifies those between the ends."""
-        share = torch.linspace(0, 1, 65, device=t0.device)
-        probes = t0.lerp(t1, share)  # (R,N+1) where the cache is looked up, which is cheap
+    def errors(self, x):
+        """E_grad and E_curv (R,) of rays with samples x (R,N,3): ray-wise averages. Eq. 4"""
+        return self.lookup(x, slice(1, 3)).mean(2)
+
+    def sample(self, rays, t0, t1, jitter, zeta):
+        """Distances (R,S+1) from t0 to t1 (R,1), dense where a surface is seen. jitter: (R,S-1) in
+        0..1, of the stratified samples between the ends."""
+        share = torch.linspace(0, 1, PROBES + 1, device=t0.device)
+        probes = t0.lerp(t1, share)  # (R,N+1)
         zeta = zeta.detach().clamp_max(self.n)  # surfaces at least half a voxel wide
         weight = composite(neus_alpha(self.sdf(rays.at(probes)), zeta))  # (R,N)
-        even = EVEN * weight.mean(1, keepdim=True)
-        _, n = jitter.shape
-        u = (torch.arange(n, device=t0.device) + jitter) / n  # (R,S-1)
-        inner = inverse_cdf(probes, weight + even + 1e-5, u)
+        uniform_weight = UNIFORM_SHARE * weight.mean(1, keepdim=True)
+        inner = inverse_cdf(probes, weight + uniform_weight + 1e-5, stratified(jitter))
         return torch.cat([t0, inner, t1], 1)
+
+
+def central_differences(s):
+    """E_grad and E_curv (n,n,n) of a field s (n,n,n) over [-1, 1]^3. E_curv = |lap s| h, h being
+    the side of a voxel. [D2]"""
+    h = 2 / (len(s) - 1)
+    padded = F.pad(s[None, None], (1,) * 6, mode="replicate")[0, 0]  # (n+2,n+2,n+2)
+    squared_slope = 0
+    second = 0
+    for axis in range(3):
+        inner = padded
+        for other in {0, 1, 2} - {axis}:
+            inner = inner.narrow(other, 1, len(s))
+        before = inner.narrow(axis, 0, len(s))
+        after = inner.narrow(axis, 2, len(s))
+        squared_slope = squared_slope + ((after - before) / (2 * h)) ** 2
+        second = second + after + before - 2 * s
+    return (squared_slope.sqrt() - 1) ** 2, second.abs() / h
 
 
 def contract(x):
@@ -604,95 +660,175 @@ def contract(x):
 
 
 class Background(nn.Module):
-    """A small NeRF before the sphere and beyond it, on an octree over contracted space."""
+    """A small NeRF before the sphere and beyond it, on an octree over contracted space. [D6]"""
     def __init__(self, points, hidden, extra, levels):
         super().__init__()
         self.octree = Octree(2.0, levels, root=32)
         seed_octree(self.octree, contract(points), dense=levels - 3)  # (N,3)
-        self.density = mlp(3 + self.octree.width, hidden, 1 + GEO)
-        self.color = mlp(GEO + extra, hidden, 3)
+        self.density = mlp(3 + self.octree.width, hidden, 1 + GEOMETRY_FEATURES)
+        self.color = mlp(GEOMETRY_FEATURES + extra, hidden, 3)
 
     def forward(self, rays, t0, t1, per_ray, jitter):
-        """Returns front (R,3), the colour before t0 (R,1); passes (R,1), the light that front lets
-        through; behind (R,3), the colour beyond t1 (R,1), dimmed by front. per_ray: (R,3+A)
-        direction and code; jitter (R,S) in 0..1, here S background samples. A sixth of them lies
-        evenly before the sphere; the others are even in u, at a distance u / (1 - u) behind it.
-        The last is opaque. [D8]"""
+        """Returns near_color (R,3), of what lies before t0 (R,1); near_transmittance (R,1);
+        far_color (R,3), of what lies beyond t1 (R,1), seen through what lies before t0; and
+        far_place (R,3), where that is on average in contracted space. per_ray: (R,3+A) direction
+        and code; jitter (R,S) in 0..1, here S background samples. A sixth of them lies evenly
+        before the sphere; the others are even in u, at a distance u / (1 - u) behind it. The last
+        is opaque."""
         _, S = jitter.shape
         n = S // 6
         place = torch.arange(S, device=t0.device) + jitter  # (R,S)
-        before = rays.near.lerp(t0, place[:, :n] / n)  # (R,n)
+        near = rays.near.lerp(t0, place[:, :n] / n)  # (R,n)
         u = (place[:, n:] - n) / (S - n)  # (R,S-n)
-        beyond = u / (1 - u).clamp_min(1e-3)
-        path = torch.cat([before, t0 + beyond], 1)  # (R,S) without the sphere, for lengths
-        t = torch.cat([before, t1 + beyond], 1)  # (R,S)
+        far = u / (1 - u).clamp_min(1e-3)
+        path = torch.cat([near, t0 + far], 1)  # (R,S) without the sphere, for lengths
+        t = torch.cat([near, t1 + far], 1)  # (R,S)
         x = contract(rays.at(t))  # (R,S,3)
         inputs = torch.cat([x, self.octree(x)], 2)  # (R,S,3+LC)
-        out = mixed_precision(self.density, inputs)  # (R,S,1+GEO)
-        sigma, geo = out.split([1, GEO], 2)
+        out = mixed_precision(self.density, inputs)  # (R,S,1+GEOMETRY_FEATURES)
+        sigma, geo = out.split([1, GEOMETRY_FEATURES], 2)
         rgb = colors_of(self.color, geo, per_ray)  # (R,S,3)
         sigma = F.softplus(sigma[..., 0] - 1)  # (R,S)
         alpha = 1 - torch.exp(-sigma[:, :-1] * path.diff())  # (R,S-1)
         w = composite(F.pad(alpha, (0, 1), value=1.0))  # (R,S)
-        passes = 1 - w[:, :n].sum(1, keepdim=True)  # (R,1)
-        colors = w[..., None] * rgb  # (R,S,3)
-        front, behind = colors.split([n, S - n], 1)
-        return front.sum(1), passes, behind.sum(1)
+        near_w, far_w = w.split([n, S - n], 1)
+        near_rgb, far_rgb = rgb.split([n, S - n], 1)
+        near_color = torch.einsum("rs,rsc->rc", near_w, near_rgb)
+        far_color = torch.einsum("rs,rsc->rc", far_w, far_rgb)
+        near_transmittance = 1 - near_w.sum(1, keepdim=True)
+        share = F.normalize(far_w.detach(), p=1, dim=1)
+        far_place = torch.einsum("rs,rsc->rc", share, x[:, n:])
+        return near_color, near_transmittance, far_color, far_place
 
 
-def render_rays(model, rays, code, jitter, points):
-    """One ray batch through the whole model, GeoNVS of section 7. code: (R,A) appearance; jitter in
-    0..1: S - 1 columns for the foreground, then the background's; points: (N,3) further places of
-    derivatives. Returns a dictionary: rgb (R,3); opacity (R,); depth (R,) and end (R,3), where the
-    ray ends on average, both without gradient; normal (R,3), times opacity, and e_curv (R,) at that
-    end; e_grad (R+N,) at ends and points; sdf (N,) at points."""
+def render_rays(model, rays, code, random, points):
+    """A batch of rays through the whole model, GeoNVS of section 7. code: (R,A) appearance; random:
+    numbers in 0..1 that place samples, S - 1 columns for the foreground, then the background's;
+    points: (N,3) further places of derivatives. Returns a dictionary: rgb (R,3); opacity (R,) of
+    the foreground; depth (R,), surface_point and place (R,3), where the ray ends on average: on the
+    foreground, and in contracted space; normal (R,3) times opacity and e_curv (R,) at surface
+    points; e_grad (R+N,) at surface points and points; sdf (N,) at points; ray_e_grad and
+    ray_e_curv (R,), averages along the ray. Depth and places have no gradient."""
+    fg_random, bg_random = random.tensor_split([model.cfg.samples - 1], 1)
     zeta = model.zeta()
-    inner, outer = jitter.tensor_split([model.cfg.samples - 1], 1)
     t0, t1 = sphere_interval(rays)  # (R,1)
-    t = model.cache.distances(rays, t0, t1, inner, zeta)  # (R,S+1)
-    sdf, geo = model.sdf(rays.at(t))  # (R,S+1), (R,S+1,G)
+    t = model.cache.sample(rays, t0, t1, fg_random, zeta)  # (R,S+1)
+    x = rays.at(t)  # (R,S+1,3)
+    sdf, geo = model.sdf(x)  # (R,S+1), (R,S+1,G)
     w = composite(neus_alpha(sdf, zeta))  # (R,S)
-    trans = 1 - w.sum(1)  # (R,) what passes all of them
-    w = F.avg_pool1d(w, 2, stride=1, padding=1)  # (R,S+1) mean of the sections beside a sample [D2]
+    opacity = w.sum(1)  # (R,)
+    w = F.pad(w, (1, 1))
+    w = 0.5 * (w[:, :-1] + w[:, 1:])  # (R,S+1) an interval has the mean colour of its ends [D1]
 
-    opacity = 1 - trans
-    depth = ((w * t).sum(1) + trans * t1[:, 0]).detach()  # (R,) if it hits nothing: where it leaves
-    end = rays.at(depth[:, None])[:, 0]  # (R,3)
-    R = len(end)
-    places = torch.cat([end, points])  # (R+N,3), as one lookup is faster than two
-    s, grad, lap = model.sdf.derivatives(places, model.eps)  # (R+N,), (R+N,3), (R+N,) [D13]
+    hit = w.detach()
+    depth = ((hit * t).sum(1) + 1e-3 * t1[:, 0]) / (hit.sum(1) + 1e-3)  # (R,) t1 if it hits nothing
+    surface_point = rays.at(depth[:, None])[:, 0]  # (R,3)
+    R = len(depth)
+    places = torch.cat([surface_point, points])  # (R+N,3), as one lookup is faster than two
+    s, grad, lap = model.sdf.derivatives(places, model.eps)  # (R+N,), (R+N,3), (R+N,) [D8]
     normal = F.normalize(grad[:R])
 
     per_ray = torch.cat([rays.d, code], 1)  # (R,3+A)
-    rgb = colors_of(model.color, geo, torch.cat([normal, per_ray], 1))  # (R,S+1,3) [D13]
+    rgb = colors_of(model.color, geo, torch.cat([normal, per_ray], 1))  # (R,S+1,3)
     rgb = torch.einsum("rs,rsc->rc", w, rgb)  # (R,3)
-    behind = model.bg_color  # (3,)
+    far_color = model.bg_color  # (3,)
+    far_place = 2 * rays.d  # (R,3) infinity
     if model.background:
-        front, passes, behind = model.background(rays, t0, t1, per_ray, outer)
-        rgb = front + passes * rgb
+        near_color, near_transmittance, far_color, far_place = model.background(
+            rays, t0, t1, per_ray, bg_random)
+        rgb = near_color + near_transmittance * rgb
+    is_solid = opacity > 0.5
+    ray_e_grad, ray_e_curv = model.cache.errors(x)
     return dict(
-        rgb=rgb + trans[:, None] * behind,
+        rgb=rgb + (1 - opacity[:, None]) * far_color,
         opacity=opacity,
+        is_solid=is_solid,
         depth=depth,
-        end=end,
+        surface_point=surface_point,
+        place=torch.where(is_solid[:, None], surface_point, far_place),
         normal=normal * opacity[:, None],  # 0 where nothing is
         e_grad=eikonal(grad),
-        e_curv=lap[:R].abs() * model.eps * opacity.detach(),  # [D3] [D4]
-        sdf=s[R:])
+        e_curv=lap[:R].abs() * model.eps * opacity.detach(),  # [D2]
+        sdf=s[R:],
+        ray_e_grad=ray_e_grad,
+        ray_e_curv=ray_e_curv)
 
 
 # ---- 6 Photos in the wild: transient mask and geometry preservation ------------------------------
+
+LAMBDA_GRAD, LAMBDA_CURV = 10.0, 2.0  # of Eq. 4 (paper)
+MASK_TRAINING = 0.6  # share of training in which the mask learns; longer, it would give people up
+REJECTION = 0.3  # share of training in which outliers are rejected
+MIN_THRESHOLD = 0.15  # no smaller error makes a pixel transient
+PLACE_CELLS = 32  # along an axis, of the table of errors over contracted space
+PLACE_QUANTILE = 0.2  # of the errors at a place: what nearly all photos have in common
+PLACE_FACTOR = 1.5  # times that quantile is usual for the place
+QUANTILE_RATE = 0.1  # how fast running quantiles move, as a logarithm per step
+
+
+def complexity(e_grad, e_curv):
+    """Complexity (R,) of the geometry along rays: the argument of the sigmoid in Eq. 4."""
+    return LAMBDA_GRAD * e_grad + LAMBDA_CURV * e_curv
+
+
+def edge_indicator(complexity, opacity, quantiles):
+    """Phi (R,): the calibrated sigmoid of Eq. 4, times opacity. It is 0.5 at the upper quartile of
+    the complexity of rays that end on the foreground; quantiles (3,): the median, that quartile and
+    95 %. A plain sigmoid is at least 0.5 on every ray, which protects all alike. [D2]"""
+    p50, p75, p95 = quantiles
+    width = ((p95 - p50) / 4).clamp_min(1e-3)
+    return opacity * torch.sigmoid((complexity - p75) / width)
+
+
+def gpl_loss(mask, phi):
+    """L_GPL, Eq. 3: the mean of M(r) Phi(r); the mask must not erase edges of the structure."""
+    return (mask * phi).mean()
+
+
+def mask_loss(logit, excess):
+    """L_reg: classification of rays (R,) by their error. Rays whose error exceeds the threshold by
+    excess (R,) are trained towards M = 1, those below it towards M = 0, weighted by the difference.
+    The same M minimises (1 - M) error + M threshold, but the gradient of that vanishes where the
+    sigmoid is flat; terms for intensity and bimodality, as printed, mask all or nothing. [D3]"""
+    is_transient = (excess > 0).float()
+    return F.binary_cross_entropy_with_logits(logit, is_transient, excess.abs())
+
+
+def reject_outliers(mask, is_outlier, done):
+    """M (R,), but 1 for outliers, rays whose error exceeds the threshold, if M exceeds a confidence
+    threshold. That rises from 0 to 1 early in training: at first the scene must not learn to paint
+    people, later it must learn its details. [D3]"""
+    confidence = (done / REJECTION) ** 2
+    return torch.where(is_outlier & (mask > confidence), 1.0, mask)
+
+
+def update_running_quantiles(running, level, group, values, is_chosen):
+    """Moves running quantiles (N,), above 0, by a factor towards the quantile `level`, a float or
+    (P,), of the chosen values (P,) of each group, an index (P,) into N: up where too many values
+    lie above it."""
+    is_below = values < running[group]  # (P,)
+    excess = (level - is_below.float()) * is_chosen
+    total = torch.zeros_like(running).index_add_(0, group, excess)
+    count = torch.zeros_like(running).index_add_(0, group, is_chosen.float())
+    running *= torch.exp(QUANTILE_RATE * total / count.clamp_min(1))
+
+
+def place_cell(place):
+    """Index (R,) into a table over contracted space, of places (R,3) in it."""
+    index = (place * 0.25 + 0.5) * PLACE_CELLS
+    return pack_index(index.long().clamp(0, PLACE_CELLS - 1), base=PLACE_CELLS)
+
 
 def conv(inputs, outputs, stride):
     return nn.Sequential(
         nn.Conv2d(inputs, outputs, 3, stride, padding=1, bias=False),
         nn.GroupNorm(8, outputs),
-        nn.ReLU())  # [D6]
+        nn.ReLU())  # [D5]
 
 
 class ContextBlock(nn.Module):
     """Context-guided block (CGNet Fig. 3), from n channels to 2n at half the resolution: local and
-    dilated context, gated globally; no residual, no 1x1. [D6]"""
+    dilated context, gated globally; no residual, no 1x1. [D5]"""
     def __init__(self, n, dilation):
         super().__init__()
         self.reduce = conv(n, n, stride=2)
@@ -716,48 +852,10 @@ def sample_logits(logits, uv):
     return at.flatten()
 
 
-def complexity(e_grad, e_curv):
-    """lambda_grad E_grad + lambda_curv E_curv with the paper's weights. Eq. 4"""
-    return 10.0 * e_grad + 2.0 * e_curv
-
-
-def gpl_loss(mask, phi):
-    """Geometry-preservation loss: mean of M(r) Phi(r). Eq. 3. It is logged; it acts through the
-    price of a ray, weight included [D7]."""
-    return (mask * phi).mean()
-
-
-def transient_loss(logit, excess):
-    """Teaches M = 1 to rays whose error exceeds their price by excess (R,), M = 0 to those where it
-    is negative. The same M minimises (1 - M) error + M price, but the slope of that vanishes where
-    the sigmoid is flat. [D7]"""
-    is_transient = (excess > 0).float()
-    return F.binary_cross_entropy_with_logits(logit, is_transient, excess.abs())
-
-
-TAUGHT = 0.6  # share of training in which the mask learns [D7]; longer, it would give people up
-
-
-def reject_outliers(mask, is_outlier, done):
-    """M (R,), but 1 for outliers, rays whose error exceeds their price, if M exceeds a bound. That
-    rises from 0 to 1 in the first 30 % of training: at first the scene must not learn to paint
-    people, later it must learn its details. [D7]"""
-    suspicion = (done / 0.3) ** 2
-    return torch.where(is_outlier & (mask > suspicion), 1.0, mask)
-
-
-def follow_quantiles(running, shares, values, is_chosen):
-    """Moves Q `running` numbers (Q,), above 0, by a factor towards the quantiles `shares`, (Q,) or
-    (), of the chosen values (R,): up where too many of them lie above it."""
-    is_below = (values[:, None] < running) & is_chosen[:, None]  # (R,Q)
-    count = is_chosen.sum()
-    excess = (count * shares - is_below.sum(0)) / count.clamp_min(1)  # (Q,) 0 if none is chosen
-    running *= torch.exp(0.1 * excess)
-
-
 class TransientMask(nn.Module):
-    """CGNet (as in CR-NeRF), which gives M, and the running quantiles that prices depend on. The
-    head reads all three resolutions: at 1/8 alone a mask could not follow an outline. [D6]"""
+    """CGNet (as in CR-NeRF), which gives M, and the running quantiles that its threshold and Phi
+    depend on. The head reads all three resolutions: at 1/8 alone a mask could not follow an
+    outline. [D5]"""
     def __init__(self, scene):
         super().__init__()
         self.stages = nn.Sequential(
@@ -766,10 +864,11 @@ class TransientMask(nn.Module):
             ContextBlock(32, dilation=4))
         self.heads = nn.ModuleList(nn.Conv2d(n, 1, 1, bias=n == 16) for n in (16, 32, 64))
         nn.init.constant_(self.heads[0].bias, -2.5)  # starts with 8 % masked, not with half
-        self.thumbs = scene.thumbs
-        self.shares = torch.tensor([0.5, 0.75, 0.95])
-        self.richness = nn.Buffer(torch.tensor([0.5, 1.0, 4.0]))  # (3,) of foreground rays
+        self.thumbs = nn.Buffer(scene.thumbs, persistent=False)
+        self.levels = nn.Buffer(torch.tensor([0.5, 0.75, 0.95]), persistent=False)
+        self.complexity = nn.Buffer(torch.tensor([0.5, 1.0, 4.0]))  # (3,) its quantiles
         self.sfm_error = nn.Buffer(torch.tensor([0.3]))  # (1,) upper quartile at SfM pixels
+        self.place_error = nn.Buffer(torch.full((PLACE_CELLS**3,), 0.1))  # lower quantile
 
     def logits(self, photos):
         """Transient logits (B,1,n/2,n/2) of photos (B,)."""
@@ -781,29 +880,75 @@ class TransientMask(nn.Module):
             logits += F.interpolate(head(y), size, mode="bilinear")
         return logits
 
-    def phi(self, richness, opacity):
-        """Phi (R,), Eq. 4: opacity times a sigmoid of the complexity `richness` (R,), which is 0.5
-        at the upper quartile of rays that end on the foreground. A plain sigmoid is at least 0.5 on
-        every ray. [D3]"""
-        p50, p75, p95 = self.richness
-        width = ((p95 - p50) / 4).clamp_min(1e-3)
-        return opacity * torch.sigmoid((richness - p75) / width)
+    def threshold(self, place, margin):
+        """The error (R,) above which rays are transient: well above the errors at SfM pixels, and
+        unusual for the place (R,3) where the ray ends. What is bad in all photos is the model's
+        fault; what is bad in one photo is a tourist. [D3]"""
+        usual = PLACE_FACTOR * self.place_error[place_cell(place)]  # (R,)
+        return torch.maximum(usual, (self.sfm_error + margin).clamp_min(MIN_THRESHOLD))
 
-    def price(self, phi, cfg):
-        """The error (R,) above which a ray is transient. [D7]"""
-        return (cfg.lam_mask + self.sfm_error).clamp_min(0.15) + cfg.lam_gpl * phi
+    def update_quantiles(self, rays, out, error):
+        """Follows the quantiles of complexity and error (R,) of a step's rays."""
+        R = len(error)
+        of_three = torch.arange(3, device=error.device).repeat_interleave(R)  # (3R,)
+        update_running_quantiles(
+            self.complexity,
+            self.levels[of_three],
+            of_three,
+            out["complexity"].repeat(3),
+            out["is_solid"].repeat(3))
+        of_one = torch.zeros_like(rays.img)
+        update_running_quantiles(self.sfm_error, 0.75, of_one, error, rays.is_static)
+        cell = place_cell(out["place"])
+        update_running_quantiles(self.place_error, PLACE_QUANTILE, cell, error, ~rays.is_masked)
 
 
 # ---- 7 The model and its objective ---------------------------------------------------------------
 
-def is_on(setting, default):
-    """Whether a part of the model is used; setting: on, off, or auto, which means default. [D15]"""
-    return default if setting == "auto" else setting == "on"
+ZETA_FLOOR = 15, 80  # at first, and after ZETA_RISE of training [D9]
+ZETA_RISE = 0.43
+MAX_PULL = 40  # zeta up to which SfM points pull harder
+CACHE_EVERY = 64  # steps between renewals of the cache
+
+
+class Parts(NamedTuple):
+    """What is modelled: no more than a scene needs. [D10]"""
+    levels: int  # of the octree
+    appearance_dim: int  # A, 0: no appearance codes
+    has_background: bool  # or one colour
+
+
+def needed_parts(cfg, raw):
+    """Parts for the scene file `raw`, unless settings say on or off."""
+    def is_on(setting, is_needed):
+        return bool(is_needed) if setting == "auto" else setting == "on"
+
+    levels = cfg.levels
+    if levels == 0:
+        pixels = 2 / raw["footprint"]  # across the sphere; footprint: a pixel's size there
+        levels = int(np.clip(1 + np.log2(pixels / ROOT), 2, 8))  # no cell smaller than a pixel
+    has_codes = is_on(cfg.appearance, raw["exposure_spread"] > 0.01)
+    has_no_color = np.isnan(raw["bg_color"]).any()  # nan: the background has no one colour
+    has_background = is_on(cfg.background, has_no_color)
+    return Parts(levels, cfg.appearance_dim if has_codes else 0, has_background)
+
+
+def objective(loss, cfg):
+    """L, the weighted sum of losses in the paper's order, with one term more, for SfM points [D7].
+    lambda_rgb is 1. Eq. 5"""
+    return (
+        loss["rgb"]
+        + cfg.lam_eik * loss["eik"]
+        + cfg.lam_curv * loss["curv"]
+        + cfg.lam_mask * loss["reg"]
+        + cfg.lam_gpl * loss["gpl"]
+        + cfg.lam_lps * loss["lps"]
+        + cfg.lam_sfm * loss["sfm"])
 
 
 class GeoNVS(nn.Module):
-    """The paper's model: it assembles the parts above and sums their losses. Make it under
-    torch.device(the scene's)."""
+    """The paper's model: the parts above, and their losses. Make it under torch.device(the
+    scene's)."""
     name = "geonvsw"
 
     def __init__(self, cfg, scene):
@@ -812,39 +957,33 @@ class GeoNVS(nn.Module):
         self.scene = scene
         # learning rates of networks; of octree features, codes and the mask, which learn faster
         self.rates = (cfg.lr_net, cfg.lr_grid, cfg.lr_code, 8e-3)
-        self.draws = cfg.samples - 1 + cfg.bg_samples  # random numbers that place a ray's samples
-        raw = scene.raw
-        hidden = cfg.hidden
-        levels = cfg.levels
-        if levels == 0:  # no cell smaller than a pixel [D15]
-            pixels = 2 / raw["footprint"]  # across the sphere; footprint: a pixel's size there
-            levels = int(np.clip(1 + np.log2(pixels / ROOT), 2, 8))
-        A = 0
-        if is_on(cfg.appearance, raw["exposure_spread"] > 0.01):
-            A = cfg.appearance_dim
+        self.random_per_ray = cfg.samples - 1 + cfg.bg_samples  # they place a ray's samples
+        levels, A, has_background = needed_parts(cfg, scene.raw)
         is_inside = scene.points.norm(dim=1) < 1
-        self.sfm = scene.points[is_inside]  # (N,3), never empty: data_prep places the sphere so
+        self.sfm = nn.Buffer(scene.points[is_inside], persistent=False)  # (N,3), never empty
+
         octree = Octree(1.0, levels)
         seed_octree(octree, self.sfm, dense=0)
-        self.sdf = SDFField(octree, hidden)
+        self.octrees = [octree]
+        self.sdf = SDFField(octree, cfg.hidden)
         self.color = nn.Sequential(
-            LipschitzLinear(GEO + octree.width + 3 + 3 + A, hidden),
+            LipschitzLinear(GEOMETRY_FEATURES + octree.width + 3 + 3 + A, cfg.hidden),
             nn.ReLU(),
-            LipschitzLinear(hidden, hidden),
+            LipschitzLinear(cfg.hidden, cfg.hidden),
             nn.ReLU(),
-            LipschitzLinear(hidden, 3))
+            LipschitzLinear(cfg.hidden, 3))
         self.appearance = nn.Embedding(len(scene.wh), A)
         self.appearance.requires_grad_(A > 0)
         nn.init.normal_(self.appearance.weight, std=0.01)
-        self.octrees = [octree]
         self.background = None
         # grey where the scene has no one colour, but --background off was given
-        self.bg_color = torch.tensor(raw["bg_color"].tolist()).nan_to_num(0.5)
-        if is_on(cfg.background, np.isnan(raw["bg_color"]).any()):  # nan: there is no one colour
-            self.background = Background(
-                scene.points[~is_inside], hidden, 3 + A, min(levels, 4))
+        bg_color = torch.tensor(scene.raw["bg_color"].tolist()).nan_to_num(0.5)
+        self.bg_color = nn.Buffer(bg_color, persistent=False)
+        if has_background:
+            outside = scene.points[~is_inside]
+            self.background = Background(outside, cfg.hidden, 3 + A, min(levels, 4))
             self.octrees.append(self.background.octree)
-        self.v = nn.Parameter(torch.tensor(math.log(20) / 10))
+        self.deviation = nn.Parameter(torch.tensor(math.log(20) / 10))
         self.mask = TransientMask(scene)
         self.cache = SDFCache(64 if levels < 4 else 128)  # as fine as the octree, within bounds
         self.cache.refresh(self.distance)
@@ -852,88 +991,87 @@ class GeoNVS(nn.Module):
 
     @property
     def eps(self):
-        """Length of the taps of finite differences: half of the finest cell there is."""
+        """Step of finite differences: half of the finest cell there is."""
         return self.sdf.octree.finest / 2
 
     def zeta(self):
-        """The deviation network: one learned number v; 1 / zeta is the width of a wall."""
-        return torch.exp(10 * self.v)
+        """The deviation network: one learned number; 1 / zeta is the width of a surface."""
+        return torch.exp(10 * self.deviation)
 
     def distance(self, x):
         """s (P,) at x (P,3)."""
         return self.sdf(x)[0]
 
     def losses(self, rays, photos, done, gen):
-        """The objective, Eq. 5, of rays that come photo by photo, equally many of each of photos
-        (B,); done: share of training, 0..1. Returns the weighted sum; raw terms by name, more for
-        the log among them; what `observe` learns from."""
+        """The objective of rays that come photo by photo, equally many of each of photos (B,);
+        done: share of training, 0..1. Returns the total; raw losses by name, and more for the log;
+        what update_statistics learns from."""
         cfg = self.cfg
         R = len(rays.o)
         code = self.appearance(photos).repeat_interleave(R // len(photos), 0)  # (R,A)
-        jitter = uniform(gen, R, self.draws)
+        random = uniform(gen, R, self.random_per_ray)
         sfm = self.sfm[random_index(gen, len(self.sfm), math.ceil(R / 4))]  # (N,3)
         near_sfm = sfm + 0.2 * uniform(gen, *sfm.shape) - 0.1  # (N,3) in cubes around them
-        out = render_rays(self, rays, code, jitter, torch.cat([sfm, near_sfm]))
+        out = render_rays(self, rays, code, random, torch.cat([sfm, near_sfm]))
         residual = (out["rgb"] - rays.rgb).abs()  # (R,3)
-
         error = residual.detach().amax(1)  # (R,) of the worst channel
-        richness = complexity(out["e_grad"][:R], out["e_curv"])  # (R,)
-        phi = self.mask.phi(richness, out["opacity"]).detach()  # (R,)
+
+        geometry = complexity(out["ray_e_grad"], out["ray_e_curv"])  # (R,)
+        phi = edge_indicator(geometry, out["opacity"].detach(), self.mask.complexity)  # (R,)
+        reg = torch.zeros(())
+        gpl = torch.zeros(())
         mask = torch.zeros_like(error)
-        l_mask = 0.0
         if cfg.mask != "off":
             logit = sample_logits(self.mask.logits(photos), rays.uv)  # (R,)
-            mask = logit.detach().sigmoid()
-            # (R,) as if SfM pixels had no error, for M = 0 [D10]
-            excess = error * ~rays.is_static - self.mask.price(phi, cfg)
-            if done < TAUGHT:
-                l_mask = transient_loss(logit, excess)
-            mask = reject_outliers(mask, excess > 0, done)
+            if done >= MASK_TRAINING:
+                logit = logit.detach()
+            M = logit.sigmoid()
+            # SfM pixels count as if they had no error: they train M = 0 [D7]
+            excess = error * ~rays.is_static - self.mask.threshold(out["place"], cfg.mask_margin)
+            reg = mask_loss(logit, excess * ~rays.is_masked)
+            gpl = gpl_loss(M, phi)
+            mask = reject_outliers(M.detach(), excess > 0, done)
+        mask = mask.masked_fill(rays.is_masked, 1)
 
-        pull = self.zeta().detach().clamp_max(40)  # [D10]
-
-        terms = dict(
-            mse=residual.square().mean(),  # for the log
+        pull = self.zeta().detach().clamp_max(MAX_PULL)  # at first s must be free to change [D7]
+        loss = dict(
             rgb=((1 - mask) * residual.mean(1)).mean(),
-            eik=out["e_grad"].mean(),  # at ends, at SfM points and near them [D13]
-            curv=out["e_curv"].mean(),  # [D4]
+            eik=out["e_grad"].mean(),  # at surface points, at SfM points and near them [D8]
+            curv=out["e_curv"].mean(),
+            reg=reg,
+            gpl=gpl,
             lps=lipschitz_loss(self.color),
-            sfm=pull * out["sdf"][:len(sfm)].abs().mean(),
-            mask=mask.mean(),  # for the log, like gpl: rejected rays count as 1
-            gpl=gpl_loss(mask, phi))
-        total = (
-            terms["rgb"]
-            + cfg.lam_eik * terms["eik"]
-            + cfg.lam_curv * terms["curv"]
-            + cfg.lam_lps * terms["lps"]
-            + cfg.lam_sfm * terms["sfm"]  # [D10]
-            + l_mask)  # lam_mask L_reg + lam_gpl L_GPL, by way of its price [D7]
-        out |= dict(error=error, mask=mask, richness=richness)
-        return total, terms, out
+            sfm=pull * out["sdf"][:len(sfm)].abs().mean())
+        total = objective(loss, cfg)
+        log = loss | dict(
+            total=total,
+            mse=residual.square().mean(),
+            mask=mask.mean())  # rejected rays count as 1
+        out |= dict(error=error, mask=mask, complexity=geometry)
+        return total, log, out
 
     def before_step(self, step, done):
-        """Keeps the cache up to date and zeta within bounds. Its floor rises from 15 to 80 in the
-        first 43 % of training (done: 0..1): soft walls hide people from the mask, and people in the
-        picture keep walls soft. The other bound is a wall of 1/64 of an even section between
-        samples; no gradient would move a thinner one. [D14]"""
-        floor = 15 + 65 * min(done / 0.43, 1.0)
+        """Renews the cache, and keeps zeta within bounds. Its floor rises with training (done:
+        0..1): soft surfaces hide people from the mask, and people in the picture keep surfaces
+        soft. The other bound is a surface of 1/64 of an even interval between samples; no gradient
+        would move a thinner one. [D9]"""
+        start, end = ZETA_FLOOR
+        floor = start + (end - start) * min(done / ZETA_RISE, 1.0)
         most = 32 * self.cfg.samples
-        self.v.data.clamp_(math.log(floor) / 10, math.log(most) / 10)
-        if step % 64 == 0:
-            self.cache.refresh(self.distance)
+        self.deviation.data.clamp_(math.log(floor) / 10, math.log(most) / 10)
+        if step % CACHE_EVERY == 0:
+            self.cache.refresh(self.distance, share=start / floor, turn=step // CACHE_EVERY)
 
-    def observe(self, rays, out):
-        """Remembers what refining and the mask's prices depend on."""
-        mask = self.mask
-        is_solid = out["opacity"] > 0.5  # (R,)
-        follow_quantiles(mask.richness, mask.shares, out["richness"], is_solid)
-        follow_quantiles(mask.sfm_error, 0.75, out["error"], rays.is_static)
-        pixel = out["depth"] / self.scene.K[rays.img, 0]  # (R,) its size at the ray's end
+    def update_statistics(self, rays, out):
+        """Remembers what refinement and the mask's threshold depend on."""
+        self.mask.update_quantiles(rays, out, out["error"])
+        is_solid = out["is_solid"]  # (R,)
+        pixel = out["depth"] / self.scene.K[rays.img, 0]  # (R,) its size at the surface point
         error = (1 - out["mask"]) * out["error"]
         columns = torch.stack([error * is_solid, pixel * is_solid, is_solid], 1)  # (R,3)
         octree = self.sdf.octree
-        node, _ = octree.locate(out["end"])
-        octree.record.index_add_(0, node[:, -1], columns)
+        node, _, _ = octree.locate(out["surface_point"])
+        octree.cell_error.index_add_(0, node[:, -1], columns)
 
     def batch(self, n, gen):
         """n random rays and the photos (B,) they come from, photo by photo."""
@@ -952,20 +1090,20 @@ class GeoNVS(nn.Module):
         return [dict(params=group) for group in (networks, grids, codes, mask)]
 
     def refine(self, optimizer):
-        """Splits cells where colours err; Adam's moments move along with their features. [D15]"""
+        """Splits cells where colours err; Adam's moments move along with their features. [D10]"""
         octree = self.sdf.octree
         if RANKS > 1:
-            dist.all_reduce(octree.record)
+            dist.all_reduce(octree.cell_error)
         state = optimizer.state.pop(octree.features)
-        is_old = octree.split(worst_cells(octree))
+        is_old = octree.split(cells_to_split(octree))
         for name in ("exp_avg", "exp_avg_sq"):
-            state[name] = place_rows(state[name], is_old)
+            state[name] = carry_over_rows(state[name], is_old)
         optimizer.state[octree.features] = state
         optimizer.param_groups[1]["params"][0] = octree.features  # see groups
 
     @torch.no_grad()
     def decide_mask(self):
-        """--mask auto: off if M marks hardly anything in 64 training photos. [D15]"""
+        """--mask auto: off if M marks hardly anything in 64 training photos. [D10]"""
         if self.cfg.mask == "auto":
             photos = self.scene.train[:64]
             share = self.mask.logits(photos).sigmoid().mean().item()
@@ -977,9 +1115,9 @@ class GeoNVS(nn.Module):
         return self.appearance.weight.detach()
 
     def render(self, rays, code):
-        """render_rays without jitter, for pictures and for fitting codes."""
-        jitter = code.new_full((len(code), self.draws), 0.5)
-        return render_rays(self, rays, code, jitter, rays.o[:0])
+        """render_rays with samples in the middle of their strata, for pictures and fitting codes."""
+        middle = code.new_full((len(code), self.random_per_ray), 0.5)
+        return render_rays(self, rays, code, middle, rays.o[:0])
 
 
 # ---- 8 Energy ------------------------------------------------------------------------------------
@@ -1058,7 +1196,7 @@ def training_step(model, optimizer, step, done, gen):
     for group, rate in zip(optimizer.param_groups, model.rates):
         group["lr"] = warm_up * decay * rate
     optimizer.step()
-    model.observe(rays, out)
+    model.update_statistics(rays, out)
     return terms
 
 
@@ -1154,10 +1292,10 @@ def train(cfg, scene, run, saved=None):
         done = share_done(cfg, state)
         if any(before < share <= done for share in REFINE_AT):
             model.refine(optimizer)
-        if before < TAUGHT <= done:
+        if before < MASK_TRAINING <= done:
             model.decide_mask()
         if done >= 1:
-            model.before_step(0, 1.0)  # pictures follow the last weights
+            model.cache.refresh(model.distance)  # pictures follow the last weights
             next_log = 0.0  # the last step is logged and saved
         if RANK == 0 and state.seconds >= next_log:
             next_log = state.seconds + PAUSE
@@ -1455,7 +1593,7 @@ def film(model, scene, path):
 def make_parser():
     parser = argparse.ArgumentParser(
         description=__doc__.splitlines()[0],
-        epilog=f"[Dn]: see geonvs.py's head. Photos on a GPU: {LARGE}",
+        epilog=f"[Dn]: see geonvs.py's head. Photos on a GPU: {GPU_DEFAULTS}",
         usage=argparse.SUPPRESS)  # so a mistake ends in one sentence
     comments = dict(re.findall(r"(\w+): .+  # (.+)", inspect.getsource(Config)))
     for setting in fields(Config):
@@ -1480,10 +1618,10 @@ def pick_device(name):
 
 
 def make_config(given):
-    """Config's defaults, then LARGE if photos meet a GPU, then flags."""
+    """Config's defaults, then GPU_DEFAULTS if photos meet a GPU, then flags."""
     cfg = Config(**given)
     if cfg.source != "toy" and pick_device(cfg.device).type == "cuda":
-        cfg = Config(**LARGE | given)
+        cfg = Config(**GPU_DEFAULTS | given)
     return cfg
 
 
