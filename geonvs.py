@@ -1140,7 +1140,7 @@ def save_checkpoint(path, model, optimizer, gen, state):
         scene=scene_facts(model.scene),
         octrees=[octree.split_keys for octree in model.octrees],
         model=model.state_dict(),
-        optimizer=optimizer.state_dict()["state"],
+        optimizer=optimizer.state_dict(),
         generator=gen.get_state(),
         state=vars(state))
     buffer = io.BytesIO()  # as torch.save calls a full disk a RuntimeError
@@ -1176,7 +1176,7 @@ def restore(saved, model, gen=None):
         model.load_state_dict(saved["model"])
         optimizer = make_optimizer(model)
         groups = optimizer.state_dict()["param_groups"]  # learning rates may be given anew
-        optimizer.load_state_dict(dict(state=saved["optimizer"], param_groups=groups))
+        optimizer.load_state_dict(dict(saved["optimizer"], param_groups=groups))
         if gen and RANK == 0:  # the others draw from their first ray again
             gen.set_state(saved["generator"])
         return optimizer, State(**saved["state"])
