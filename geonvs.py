@@ -1117,21 +1117,21 @@ def scene_facts(scene):
 
 def check_same_scene(saved, now):
     """UserError with the first difference between the scene_facts of a checkpoint and of now."""
+    advice = "use its photos, model and flags, or train under another --name"
     photos = itertools.zip_longest(saved["name"], now["name"], fillvalue="nothing")
     for before, name in photos:
         check(before == name, f"checkpoint.pt was trained with photo {before}, and here is {name} "
-              "in its place: put its photos and model back, or train under another --name")
+              f"in its place: {advice}")
     for key in ("is_test", "wh", "K", "c2w", "sphere"):
         rows = len(now[key])
         new = np.array(now[key], float).reshape(rows, -1)
         old = np.array(saved[key], float).reshape(rows, -1)
         # a scene file that another machine made may differ in the last digits
         for row, column in np.argwhere(~np.isclose(old, new, rtol=1e-6, atol=1e-6)):
-            place = "scene" if key == "sphere" else now["name"][row]
+            place = "the scene" if key == "sphere" else now["name"][row]
             raise UserError(
                 f"checkpoint.pt was trained with other data: {key} of {place}, number {column}, "
-                f"was {old[row, column]:.9g} and is {new[row, column]:.9g}; put its photos and "
-                "model back, or train under another --name")
+                f"was {old[row, column]:.9g} and is {new[row, column]:.9g}: {advice}")
 
 
 def save_checkpoint(path, model, optimizer, gen, state):
@@ -1762,8 +1762,10 @@ def run_command_line(entry):
     try:
         entry()
         return
-    except (UserError, OSError) as error:  # a full disk, a folder without permission
+    except UserError as error:
         message = str(error)
+    except OSError as error:  # a full disk, a folder without permission
+        message = f"{error}: mend that; a run that has a checkpoint goes on with --resume"
     except (RuntimeError, MemoryError) as error:  # a CPU's allocator has no error of its own
         if isinstance(error, RuntimeError) and "allocate" not in str(error):
             raise

@@ -2360,7 +2360,7 @@ def test_a_checkpoint_of_other_settings_is_refused(loop, changes):
     ("wh", (2, 1), "wh of toy_002.png, number 1"),
     ("K", (3, 0), "K of toy_003.png, number 0"),
     ("c2w", (4, 2, 3), "c2w of toy_004.png, number 11"),
-    ("scale", (), "sphere of scene, number 3")])
+    ("scale", (), "sphere of the scene, number 3")])
 def test_a_checkpoint_of_another_scene_names_the_difference(warm, scene, key, place, words):
     raw = copy.deepcopy(scene.raw)
     raw[key] = np.array(raw[key])
