@@ -41,19 +41,36 @@ Departures from the printed paper; the tag stands at the code, with the reason
   [D10] cells split where colours err and are never pruned; parts that a scene does not need are off
 """
 import argparse
+import contextlib
+import functools
 import inspect
 import io
+import itertools
 import json
 import math
 import os
 import re
-import resource
+import shutil
+import signal
+import sqlite3
 import subprocess
 import sys
+import tempfile
 import time
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import NamedTuple
+
+
+def stop_at_once(*_):
+    """Handles Ctrl-C and SIGTERM while the libraries below are loaded."""
+    os.write(2, b"error: stopped before anything was begun\n")
+    os._exit(2)
+
+
+if __name__ == "__main__":
+    signal.signal(signal.SIGINT, stop_at_once)
+    signal.signal(signal.SIGTERM, stop_at_once)
 
 import cv2
 import numpy as np
@@ -122,6 +139,7 @@ class Config:
     lr_grid: float = 1e-2  # learning rate of octree features
     lr_code: float = 3e-2  # learning rate of appearance codes
     lr_net: float = 4e-3  # learning rate of networks
+    lr_mask: float = 8e-3  # learning rate of the mask network
 
     def __post_init__(self):
         """Refuses numbers that cannot work, before anything is written."""
@@ -446,15 +464,21 @@ def cells_to_split(octree):
 
 GEOMETRY_FEATURES = 15  # that the SDF network hands to the colour network
 START_RADIUS = 0.25  # of the sphere that s starts as; it grows to the landmark [D7]
-MIXED_ON = "cuda"  # where colour and background networks run in bfloat16
+
+
+@functools.cache
+def has_bfloat16(device_type):
+    """Whether a kind of device computes in bfloat16 itself: GPUs from Ampere on."""
+    return device_type == "cuda" and torch.cuda.is_bf16_supported(including_emulation=False)
 
 
 def mixed_precision(network, x):
     """network(x), computed in bfloat16 where that pays, returned as float32. Not for distances:
     finite differences need float32."""
-    if x.device.type != MIXED_ON:
+    device_type = x.device.type
+    if not has_bfloat16(device_type):
         return network(x)
-    with torch.autocast(MIXED_ON, torch.bfloat16):
+    with torch.autocast(device_type, torch.bfloat16):
         return network(x).float()
 
 
@@ -955,8 +979,6 @@ class GeoNVS(nn.Module):
         super().__init__()
         self.cfg = replace(cfg)  # a copy, as training decides --mask auto
         self.scene = scene
-        # learning rates of networks; of octree features, codes and the mask, which learn faster
-        self.rates = (cfg.lr_net, cfg.lr_grid, cfg.lr_code, 8e-3)
         self.random_per_ray = cfg.samples - 1 + cfg.bg_samples  # they place a ray's samples
         levels, A, has_background = needed_parts(cfg, scene.raw)
         is_inside = scene.points.norm(dim=1) < 1
@@ -1044,7 +1066,6 @@ class GeoNVS(nn.Module):
             sfm=pull * out["sdf"][:len(sfm)].abs().mean())
         total = objective(loss, cfg)
         log = loss | dict(
-            total=total,
             mse=residual.square().mean(),
             mask=mask.mean())  # rejected rays count as 1
         out |= dict(error=error, mask=mask, complexity=geometry)
@@ -1081,25 +1102,34 @@ class GeoNVS(nn.Module):
         return random_rays(self.scene, img, gen), picked
 
     def groups(self):
-        """Optimiser groups, in the order of rates."""
+        """Optimiser groups with their names and learning rates."""
+        cfg = self.cfg
         grids = [octree.features for octree in self.octrees]
         codes = [self.appearance.weight]
         mask = list(self.mask.parameters())
         special = set(grids + codes + mask)
         networks = [p for p in self.parameters() if p not in special]
-        return [dict(params=group) for group in (networks, grids, codes, mask)]
+        return [
+            dict(name="networks", params=networks, base_lr=cfg.lr_net),
+            dict(name="grids", params=grids, base_lr=cfg.lr_grid),
+            dict(name="codes", params=codes, base_lr=cfg.lr_code),
+            dict(name="mask", params=mask, base_lr=cfg.lr_mask)]
 
     def refine(self, optimizer):
         """Splits cells where colours err; Adam's moments move along with their features. [D10]"""
         octree = self.sdf.octree
         if RANKS > 1:
             dist.all_reduce(octree.cell_error)
+        # sums of floats differ between GPUs: one process chooses the cells for all
+        worst = from_first_process(cells_to_split(octree).cpu())
         state = optimizer.state.pop(octree.features)
-        is_old = octree.split(cells_to_split(octree))
+        is_old = octree.split(worst.to(octree.features.device))
         for name in ("exp_avg", "exp_avg_sq"):
             state[name] = carry_over_rows(state[name], is_old)
         optimizer.state[octree.features] = state
-        optimizer.param_groups[1]["params"][0] = octree.features  # see groups
+        for group in optimizer.param_groups:
+            if group["name"] == "grids":
+                group["params"] = [octree.features for octree in self.octrees]
 
     @torch.no_grad()
     def decide_mask(self):
@@ -1151,10 +1181,12 @@ def metered_joules(device, joules):
 
 REFINE_AT = (0.1, 0.2, 0.3, 0.45, 0.6)  # shares of training at which the octree is refined
 PAUSE = 30  # seconds between lines of the log; a checkpoint is made with each
-RESULTS = ("checkpoint.pt", "log.jsonl", "metrics.json", "panel.png", "mesh.ply", "film.mp4")
-# torchrun starts RANKS processes. Each draws its own rays and follows its own prices, the gradients
-# are averaged, the first process decides, speaks and writes; so all hold the same weights.
+PROGRESS = ("checkpoint.pt", "log.jsonl")  # what training writes
+RESULTS = ("metrics.json", "codes.npy", "panel.png", "mesh.ply", "film.mp4")  # and held_out/
+# torchrun starts RANKS processes. Each draws its own rays and follows its own quantiles, the
+# gradients are averaged, the first process decides, speaks and writes; so all hold the same weights.
 RANK = int(os.environ.get("RANK", 0))
+LOCAL_RANK = int(os.environ.get("LOCAL_RANK", RANK))  # on this machine
 RANKS = int(os.environ.get("WORLD_SIZE", 1))
 
 
@@ -1183,7 +1215,8 @@ def average_gradients(model):
 
 def training_step(model, optimizer, step, done, gen):
     """One update; the learning rate rises for 20 steps, then follows a cosine down to 5 %. done:
-    share of training, 0..1. Returns the raw terms of the loss. Never waits for the device."""
+    share of training, 0..1. Returns the raw terms of the loss and their weighted total. Never
+    waits for the device."""
     model.before_step(step, done)
     rays, picked = model.batch(model.cfg.rays // RANKS, gen)
     loss, terms, out = model.losses(rays, picked, done, gen)
@@ -1193,11 +1226,11 @@ def training_step(model, optimizer, step, done, gen):
         average_gradients(model)
     warm_up = min(1, (step + 1) / 20)
     decay = 0.525 + 0.475 * math.cos(math.pi * done)
-    for group, rate in zip(optimizer.param_groups, model.rates):
-        group["lr"] = warm_up * decay * rate
+    for group in optimizer.param_groups:
+        group["lr"] = warm_up * decay * group["base_lr"]
     optimizer.step()
     model.update_statistics(rays, out)
-    return terms
+    return terms | dict(total=loss.detach())
 
 
 def share_done(cfg, state):
@@ -1212,10 +1245,37 @@ def make_optimizer(model):
     return torch.optim.Adam(model.groups(), betas=(0.9, 0.99), eps=1e-15, fused=True)
 
 
+def scene_facts(scene):
+    """What the weights of a model depend on, in plain values."""
+    raw = scene.raw
+    facts = {key: raw[key].tolist() for key in ("name", "is_test", "wh", "K", "c2w")}
+    facts["sphere"] = [[*raw["center"].tolist(), float(raw["scale"])]]
+    return facts
+
+
+def check_same_scene(saved, now):
+    """UserError with the first difference between the scene_facts of a checkpoint and of now."""
+    advice = "use its photos, model and flags, or train under another --name"
+    photos = itertools.zip_longest(saved["name"], now["name"], fillvalue="nothing")
+    for before, name in photos:
+        check(before == name, f"checkpoint.pt was trained with photo {before}, and here is {name} "
+              f"in its place: {advice}")
+    for key in ("is_test", "wh", "K", "c2w", "sphere"):
+        rows = len(now[key])
+        new = np.array(now[key], float).reshape(rows, -1)
+        old = np.array(saved[key], float).reshape(rows, -1)
+        # a scene file that another machine made may differ in the last digits
+        for row, column in np.argwhere(~np.isclose(old, new, rtol=1e-6, atol=1e-6)):
+            place = "the scene" if key == "sphere" else now["name"][row]
+            raise UserError(
+                f"checkpoint.pt was trained with other data: {key} of {place}, number {column}, "
+                f"was {old[row, column]:.9g} and is {new[row, column]:.9g}: {advice}")
+
+
 def save_checkpoint(path, model, optimizer, gen, state):
     saved = dict(
         config=vars(model.cfg),
-        scene=model.scene.info,
+        scene=scene_facts(model.scene),
         octrees=[octree.split_keys for octree in model.octrees],
         model=model.state_dict(),
         optimizer=optimizer.state_dict(),
@@ -1234,28 +1294,65 @@ def read_checkpoint(path, given):
     try:
         data_prep.refuse_bomb(path)
         saved = dict(torch.load(path, map_location="cpu", weights_only=True))
-        return saved, Config(**saved["config"] | given)
+        settings = saved["config"] | given
     except Exception as error:  # a damaged file can fail in any layer: zip, pickle, tensor storage
         raise UserError(f"{path} is damaged, too large for the memory or of another program "
                         f"({type(error).__name__}): train again under another --name")
+    unknown = settings.keys() - {setting.name for setting in fields(Config)}
+    check(not unknown, f"{path} has settings that this version of geonvs.py does not know "
+          f"({', '.join(map(str, unknown))}): use the version that made it, or another --name")
+    return saved, Config(**settings)
 
 
 def restore(saved, model, gen=None):
     """Puts a checkpoint's weights into a model, and its random numbers into gen, which must be of
     the same kind of device; returns its optimiser and State."""
     try:
-        check(saved["scene"] == model.scene.info, "another scene or split")
+        check_same_scene(saved["scene"], scene_facts(model.scene))
         for octree, keys in zip(model.octrees, saved["octrees"], strict=True):
             octree.build(keys.to(octree.child.device))
         model.load_state_dict(saved["model"])
         optimizer = make_optimizer(model)
-        optimizer.load_state_dict(saved["optimizer"])
+        groups = optimizer.state_dict()["param_groups"]  # learning rates may be given anew
+        optimizer.load_state_dict(dict(saved["optimizer"], param_groups=groups))
         if gen and RANK == 0:  # the others draw from their first ray again
             gen.set_state(saved["generator"])
         return optimizer, State(**saved["state"])
+    except UserError:
+        raise
     except Exception as error:  # as in read_checkpoint
         raise UserError(f"checkpoint.pt does not fit scene and settings ({error!r:.90}): use flags "
                         "and kind of device as it was made with, or another --name")
+
+
+def load_run(run, **given):
+    """Model, scene and appearance codes (I,A) of all photos of a run that was trained, such as
+    runs/toy-geonvsw-0. Settings may be given anew: device="cpu"."""
+    run = Path(run)
+    saved, cfg = read_checkpoint(run / "checkpoint.pt", given)
+    device = pick_device(cfg.device)
+    scene = load_scene(data_prep.open_scene(cfg.source, cfg.downscale), device)
+    with device:
+        model = GeoNVS(cfg, scene)
+    restore(saved, model)
+    codes = model.codes()
+    if (run / "codes.npy").exists():  # finished: codes of test photos are fitted
+        codes = torch.as_tensor(np.load(run / "codes.npy"), device=device)
+    return model, scene, codes
+
+
+@contextlib.contextmanager
+def postponed_signals():
+    """Collects Ctrl-C and SIGTERM in the list it yields, so that a step is finished first."""
+    caught = []
+    handlers = {}
+    for number in (signal.SIGINT, signal.SIGTERM):
+        handlers[number] = signal.signal(number, lambda number, _: caught.append(number))
+    try:
+        yield caught
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
 
 
 def train(cfg, scene, run, saved=None):
@@ -1271,38 +1368,49 @@ def train(cfg, scene, run, saved=None):
         model = GeoNVS(cfg, scene)
     optimizer = make_optimizer(model)
     state = State()
-    stale = RESULTS
     if saved:
         optimizer, state = restore(saved, model, gen)
-        stale = RESULTS[2:]  # checkpoint and log go on
-    for name in stale:  # nothing of a former run may be taken for this one's
-        (run / name).unlink(missing_ok=True)
+    done = share_done(cfg, state)
+    if done < 1 and RANK == 0:
+        remove_results(run, () if saved else PROGRESS)
     meter = metered_joules(gen.device, state.joules)
     next(meter, None)  # it counts from here
     begin = time.perf_counter() - state.seconds
     next_log = 0.0
-    done = share_done(cfg, state)
-    while done < 1:
-        terms = training_step(model, optimizer, state.step, done, gen)
-        state.step += 1
-        # several processes agree on time now and then, and at the last step
-        if RANKS == 1 or state.step % 16 == 0 or state.step == cfg.steps:
-            state.seconds = from_first_process(time.perf_counter() - begin)
-        before = done
-        done = share_done(cfg, state)
-        if any(before < share <= done for share in REFINE_AT):
-            model.refine(optimizer)
-        if before < MASK_TRAINING <= done:
-            model.decide_mask()
-        if done >= 1:
-            model.cache.refresh(model.distance)  # pictures follow the last weights
-            next_log = 0.0  # the last step is logged and saved
-        if RANK == 0 and state.seconds >= next_log:
-            next_log = state.seconds + PAUSE
-            state.joules = next(meter, None)  # None, never 0, once a counter has failed
-            report(model, run / "log.jsonl", done, state, terms)
-            save_checkpoint(run / "checkpoint.pt", model, optimizer, gen, state)
+    is_stopped = False
+    with postponed_signals() as signals:
+        while done < 1 and not is_stopped:
+            terms = training_step(model, optimizer, state.step, done, gen)
+            state.step += 1
+            # several processes agree now and then, and at the last step
+            if RANKS == 1 or state.step % 16 == 0 or state.step == cfg.steps:
+                seconds = time.perf_counter() - begin
+                state.seconds, is_stopped = from_first_process((seconds, len(signals) > 0))
+            before = done
+            done = share_done(cfg, state)
+            if any(before < share <= done for share in REFINE_AT):
+                model.refine(optimizer)
+            if before < MASK_TRAINING <= done:
+                model.decide_mask()
+            if done >= 1:
+                model.cache.refresh(model.distance)  # pictures follow the last weights
+            is_last = done >= 1 or is_stopped
+            if RANK == 0 and (is_last or state.seconds >= next_log):
+                next_log = state.seconds + PAUSE
+                state.joules = next(meter, None)  # None, never 0, once a counter has failed
+                report(model, run / "log.jsonl", done, state, terms)
+                save_checkpoint(run / "checkpoint.pt", model, optimizer, gen, state)
+    if is_stopped or signals:
+        raise KeyboardInterrupt(
+            f"stopped; step {state.step} is saved, and the same command with --resume goes on")
     return model, state
+
+
+def remove_results(run, more):
+    """Nothing of a former training may be taken for this one's."""
+    for name in (*RESULTS, *more):
+        (run / name).unlink(missing_ok=True)
+    shutil.rmtree(run / "held_out", ignore_errors=True)
 
 
 def report(model, path, done, state, terms):
@@ -1318,6 +1426,9 @@ def report(model, path, done, state, terms):
 
 
 # ---- 10 Scoring, mesh, pictures ------------------------------------------------------------------
+
+RENDER_RAYS = dict(cpu=2**10, cuda=2**14)  # rendered at a time: 2 GB on a GPU
+
 
 def to_uint8(picture):
     """Numbers in 0..1 as bytes."""
@@ -1342,8 +1453,8 @@ def make_lpips():
 
 
 def fit_codes(model, scene, photos, steps=128, n=64):
-    """Appearance codes (B,A) of unseen photos (B,): Adam on n random rays a step of each left half
-    [D12], from the mean code of the training photos. The scene stays as it is."""
+    """Appearance codes (B,A) of unseen photos (B,): Adam on n random rays a step of each left half,
+    from the mean code of the training photos. The scene stays as it is."""
     gen = torch.Generator(photos.device).manual_seed(0)
     mean = model.codes()[scene.train].mean(0)  # (A,)
     codes = mean.repeat(len(photos), 1)  # (B,A)
@@ -1362,6 +1473,12 @@ def fit_codes(model, scene, photos, steps=128, n=64):
     return codes.detach()
 
 
+def write_png(path, picture):
+    """An RGB picture (H,W,3) of bytes; encoded here, as cv2 cannot open every path."""
+    _, data = cv2.imencode(".png", picture[..., ::-1])
+    atomic_write(path, lambda part: part.write_bytes(data))
+
+
 def photo_rays(scene, photo):
     """The rays of all pixels of a photo, row by row."""
     pixel = torch.arange(scene.wh[photo].prod(), device=scene.wh.device)
@@ -1370,20 +1487,23 @@ def photo_rays(scene, photo):
 
 @torch.no_grad()
 def render_photo(model, scene, photo, code):
-    """A photo's view under an appearance code (A,): its colours, the photo itself and normals, in
-    one array (3,H,W,3)."""
+    """A photo's view under an appearance code (A,): its colours, the photo itself, normals, each
+    (H,W,3), and depth (H,W), along the ray."""
     w, h = scene.wh[photo].tolist()
     parts = []
-    for pixel in torch.arange(w * h, device=code.device).split(1024):
+    for pixel in torch.arange(w * h, device=code.device).split(RENDER_RAYS[code.device.type]):
         rays = make_rays(scene, torch.full_like(pixel, photo), pixel)
         out = model.render(rays, code.expand(len(pixel), -1))
-        parts.append(torch.stack([out["rgb"], rays.rgb, out["normal"]]))  # (3,R,3)
-    return torch.cat(parts, 1).reshape(3, h, w, 3).cpu().numpy()
+        columns = [out["rgb"], rays.rgb, out["normal"], out["depth"][:, None]]
+        parts.append(torch.cat(columns, 1))  # (R,10)
+    picture = torch.cat(parts).reshape(h, w, 10).cpu().numpy()
+    rgb, truth, normal, depth = np.split(picture, [3, 6, 9], axis=2)
+    return rgb, truth, normal, depth[..., 0]
 
 
 def score(rgb, truth, lpips=None):
-    """The right half of a rendered photo [D12], rounded to 8 bits, against the truth, beside the
-    trivial predictor: the mean colour of each row of the left half. SSIM: Gaussian window of 11 px,
+    """The right half of a rendered photo, rounded to 8 bits, against the truth, beside a baseline
+    (psnr_floor): each row of pixels in the mean colour of its left half. SSIM: Gaussian window of 11 px,
     sigma 1.5, no border. None where a picture is too small."""
     half = truth.shape[1] // 2
     want = truth[:, half:]
@@ -1408,18 +1528,23 @@ def score(rgb, truth, lpips=None):
     return row
 
 
-def evaluate(model, scene, lpips=None):
-    """Scores of the test photos by the half-image protocol [D12], per photo and on average, None
-    where there are none; codes (I,A) of all photos, those of test photos fitted."""
+def evaluate(model, scene, lpips=None, folder=None):
+    """Scores of the test photos by the half-image protocol, per photo and on average, None
+    where there are none; codes (I,A) of all photos, those of test photos fitted. Writes each photo
+    with its render to the right of it into a folder, if one is given."""
     codes = model.codes().clone()
     for some in scene.test.split(32):
         codes[some] = fit_codes(model, scene, some)
     rows = []
     for photo in progress(scene.test.tolist(), "scoring held-out photos"):
-        rgb, truth, _ = render_photo(model, scene, photo, codes[photo])
+        rgb, truth, _, _ = render_photo(model, scene, photo, codes[photo])
+        name = str(scene.raw["name"][photo])
         row = score(rgb, truth, lpips)
-        row["name"] = scene.raw["name"][photo]
+        row["name"] = name
         rows.append(row)
+        if folder:
+            path = Path(folder, name).with_suffix(".png")
+            write_png(path, to_uint8(np.hstack([truth, rgb])))
     scores = dict(per_image=rows)
     for key in ("psnr", "psnr_floor", "ssim", "lpips"):
         values = [row[key] for row in rows if row[key] is not None]
@@ -1427,11 +1552,24 @@ def evaluate(model, scene, lpips=None):
     return scores, codes
 
 
+def depth_edges(depth):
+    """Whether depth (H,W) jumps by 5 % or more between a pixel and one of its four neighbours."""
+    depth = depth.astype(np.float32).clip(max=1e4)  # inf is sky
+    edges = np.zeros(depth.shape, bool)
+    for axis in (0, 1):
+        jump = np.abs(np.diff(np.log(depth), axis=axis)) > math.log(1.05)
+        before, after = np.moveaxis(edges, axis, 0)[:-1], np.moveaxis(edges, axis, 0)[1:]
+        before |= np.moveaxis(jump, axis, 0)
+        after |= np.moveaxis(jump, axis, 0)
+    return edges
+
+
 @torch.no_grad()
 def toy_truth(model, scene):
     """What only a toy can tell. sdf_error: mean |s - s_true| near visible walls, scene units;
-    normal_error: median angle at walls, degrees, by taps of 0.004. mask_iou, mask_static: M > 0.5
-    against the true occluders of training photos, and mean M on all other pixels; None without."""
+    normal_error: median angle at walls, degrees, by taps of 0.004. mask_iou: M > 0.5 against the
+    true occluders of training photos. False positives, mean M on static pixels: mask_static of all,
+    mask_edges of those beside a jump of depth, mask_flat of the others. None without a mask."""
     raw = scene.raw
     near, sdf, wall, normal = [
         torch.as_tensor(raw[name]).to(scene.c2w)
@@ -1442,15 +1580,23 @@ def toy_truth(model, scene):
         sdf_error=(model.distance(near) - sdf).abs().mean().item(),
         normal_error=cos.acos().rad2deg().median().item(),
         mask_iou=None,
-        mask_static=None)
+        mask_static=None,
+        mask_edges=None,
+        mask_flat=None)
     if model.cfg.mask == "off":
         return truth
     masks = [
         sample_logits(model.mask.logits([photo]), photo_rays(scene, photo).uv).sigmoid()
         for photo in scene.train.tolist()]
     mask = torch.cat(masks).cpu().numpy()
-    people = raw["occluder"][np.repeat(~raw["is_test"], np.diff(raw["start"]))]  # by pixel
-    truth["mask_static"] = float(mask[~people].mean())
+    is_train = np.repeat(~raw["is_test"], np.diff(raw["start"]))  # by pixel
+    people = raw["occluder"][is_train]
+    edges = np.concatenate([
+        depth_edges(depth.reshape(h, w)).ravel()
+        for depth, (w, h) in zip(np.split(raw["depth"], raw["start"][1:-1]), raw["wh"])])[is_train]
+    for key, some in dict(
+            mask_static=~people, mask_edges=~people & edges, mask_flat=~people & ~edges).items():
+        truth[key] = float(mask[some].mean()) if some.any() else None
     if people.any():
         found = mask > 0.5
         truth["mask_iou"] = (found & people).sum() / (found | people).sum()
@@ -1463,7 +1609,8 @@ def extract_mesh(model):
     surface; elsewhere the cache gives its sign."""
     n = min(round(2 / model.eps), 512)
     cache = model.cache
-    volume = F.interpolate(cache.volume, n + 1, mode="trilinear", align_corners=True)[0, 0]
+    s = cache.volume[:, :1]
+    volume = F.interpolate(s, n + 1, mode="trilinear", align_corners=True)[0, 0]
     near = volume.abs() < 6 / cache.n
     volume[near] = in_chunks(model.distance, near.nonzero() * (2 / n) - 1)
     volume = volume.cpu().numpy()
@@ -1477,71 +1624,122 @@ def extract_mesh(model):
     return vertices * raw["scale"] + raw["center"], faces
 
 
-def write_ply(path, vertices, faces):
-    """A PLY file of text; with fewer than nine digits coordinates of a map lose centimetres."""
+@torch.no_grad()
+def mesh_colors(model, vertices):
+    """Colours (P,3) of vertices (P,3) in SfM units, seen along their normals in the mean light of
+    the training photos."""
+    scene = model.scene
+    mean = model.codes()[scene.train].mean(0)  # (A,)
+
+    def colors(x):
+        _, geo = model.sdf(x)  # (P,G)
+        _, grad, _ = model.sdf.derivatives(x, model.eps)
+        normal = F.normalize(grad)
+        per_ray = torch.cat([normal, -normal, mean.expand(len(x), -1)], 1)  # (P,3+3+A)
+        return colors_of(model.color, geo[:, None], per_ray)[:, 0]
+    x = (vertices - scene.raw["center"]) / scene.raw["scale"]
+    return in_chunks(colors, torch.as_tensor(x).to(scene.c2w)).cpu().numpy()
+
+
+def write_ply(path, vertices, faces, colors):
+    """A binary PLY file; coordinates are doubles, as floats would round those of a map."""
+    vertex_type = [("xyz", "<f8", 3), ("rgb", "u1", 3)]
+    vertex = np.empty(len(vertices), vertex_type)
+    vertex["xyz"] = vertices
+    vertex["rgb"] = to_uint8(colors)
+    face = np.empty(len(faces), [("count", "u1"), ("corner", "<i4", 3)])
+    face["count"] = 3
+    face["corner"] = faces
     header = f"""ply
-format ascii 1.0
+format binary_little_endian 1.0
 element vertex {len(vertices)}
 property double x
 property double y
 property double z
+property uchar red
+property uchar green
+property uchar blue
 element face {len(faces)}
 property list uchar int vertex_indices
 end_header
 """
+    data = header.encode() + vertex.tobytes() + face.tobytes()
+    atomic_write(path, lambda part: part.write_bytes(data))
 
-    def write(part):
-        with open(part, "w") as file:
-            file.write(header)
-            np.savetxt(file, vertices, "%.9g")
-            np.savetxt(file, faces, "3 %d %d %d")
-    atomic_write(path, write)
+
+def depth_picture(depth, opacity):
+    """Depth (H,W) as colours (H,W,3) of bytes: red is near, blue far, black where nothing is."""
+    solid = depth[opacity > 0.5]
+    near = solid.min(initial=1e9)
+    far = solid.max(initial=0)
+    share = (far - depth) / max(far - near, 1e-6)
+    color = cv2.applyColorMap(to_uint8(share), cv2.COLORMAP_TURBO)[..., ::-1]
+    return (color * opacity[..., None]).astype(np.uint8)
 
 
 def write_panel(path, model, scene, codes):
     """A row for two held-out photos and two of training: photo, render under codes (I,A), normals
-    of the surface, and what the mask network says of the photo."""
+    and depth of the surface, and what the mask network says of the photo."""
     rows = []
     for photo in scene.test[:2].tolist() + scene.train[:2].tolist():
-        rgb, truth, normal = render_photo(model, scene, photo, codes[photo])
-        tiles = [truth, rgb, normal / 2 + 0.5]
+        rgb, truth, normal, depth = render_photo(model, scene, photo, codes[photo])
+        tiles = [to_uint8(tile) for tile in (truth, rgb, normal / 2 + 0.5)]
+        tiles.append(depth_picture(depth, np.linalg.norm(normal, axis=2)))
         kind = "held out" if photo in scene.test else "training"
-        text = f"{kind}: {scene.raw['name'][photo]}, render, normals"
+        text = f"{kind}: {scene.raw['name'][photo]}, render, normals, depth (red: near)"
         if model.cfg.mask != "off":
             M = model.mask.logits([photo])[0, 0].detach().sigmoid().cpu()  # (n/2,n/2)
-            tiles.append(np.dstack([M] * 3))
+            tiles.append(to_uint8(np.dstack([M] * 3)))
             text += ", mask (white: transient)"
         h, w, _ = rgb.shape
         size = (240, 240 * h // w)
-        row = [cv2.resize(to_uint8(tile), size, interpolation=cv2.INTER_AREA) for tile in tiles]
+        row = [cv2.resize(tile, size, interpolation=cv2.INTER_AREA) for tile in tiles]
         row = np.insert(np.hstack(row), [0] * 20, 255, axis=0)  # 20 white lines for the title
         cv2.putText(row, text, (2, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.4, 0)
         rows.append(row)
-    atomic_write(path, lambda part: cv2.imwrite(str(part), np.vstack(rows)[..., ::-1]))
+    write_png(path, np.vstack(rows))
 
 
-def finish(model, scene, state, run):
-    """Scores a trained model; writes metrics.json, panel.png and mesh.ply below run. Returns the
-    metrics, and prints those that are one number with a fraction."""
+def peak_memory(device):
+    """Most bytes that were in use at a time, of the device; None on Windows."""
+    if device.type == "cuda":
+        return torch.cuda.max_memory_allocated()
+    try:
+        import resource
+    except ImportError:
+        return None
     unit = 1 if sys.platform == "darwin" else 1024  # bytes
-    peak = unit * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss  # before scoring
+    return unit * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+
+
+def model_bytes(model):
+    """Bytes of parameters and of all tensors of octrees."""
+    tensors = list(model.parameters())
+    for octree in model.octrees:
+        tensors += octree.buffers()
+        tensors += filter(torch.is_tensor, vars(octree).values())
+    return sum(tensor.nbytes for tensor in tensors)
+
+
+def code_version():
+    """The commit of this file; None without git."""
+    folder = str(Path(__file__).parent)
+    command = ["git", "-C", folder, "describe", "--always", "--dirty"]
+    try:
+        answer = subprocess.run(command, capture_output=True, text=True)
+    except OSError:  # git is not installed
+        return None
+    return answer.stdout.strip() or None
+
+
+def describe_run(model, scene, state):
+    """What metrics.json says beside scores: what was trained, how long, on which machine."""
     machine = f"cpu, {torch.get_num_threads()} threads"
     if scene.c2w.is_cuda:
-        peak = torch.cuda.max_memory_allocated()
         machine = torch.cuda.get_device_name()
-    scores, codes = evaluate(model, scene, make_lpips())
-    write_panel(run / "panel.png", model, scene, codes)
-    if model.octrees:  # a rival has none
-        scores["octree_cells"] = model.sdf.octree.cells[:, 0].bincount().tolist()  # by level
-        write_ply(run / "mesh.ply", *extract_mesh(model))
-        if "wall" in scene.raw:  # the toy
-            scores |= toy_truth(model, scene)
     joules = state.joules
     is_metered = joules is not None
-    parameters = sum(p.numel() for p in model.parameters())
-    status, commit = subprocess.getstatusoutput(
-        f'git -C "{Path(__file__).parent}" describe --always --dirty')
-    metrics = scores | dict(
+    return dict(
         scene=scene.info["scene"],
         method=model.name,
         seed=model.cfg.seed,
@@ -1551,14 +1749,34 @@ def finish(model, scene, state, run):
         energy_wh=joules / 3600 if is_metered else None,
         energy_source=f"the device's counter, read every {PAUSE} s" if is_metered else None,
         rays_per_second=state.step * model.cfg.rays / state.seconds,
-        parameters=parameters,
-        # a cell: child, 8 corners, 8 flags
-        model_bytes=4 * parameters + 44 * sum(len(octree.cells) for octree in model.octrees),
-        peak_memory_bytes=peak,
+        parameters=sum(p.numel() for p in model.parameters()),
+        model_bytes=model_bytes(model),
         protocol="appearance fitted on the left half, scored on the right half",
         torch=torch.__version__,
-        commit=None if status else commit,
+        commit=code_version(),
         config=vars(model.cfg))
+
+
+def write_mesh(path, model):
+    vertices, faces = extract_mesh(model)
+    if len(faces) == 0:
+        print(f"  {path} is empty: no surface lies in the unit sphere; train longer")
+    write_ply(path, vertices, faces, mesh_colors(model, vertices))
+
+
+def finish(model, scene, state, run):
+    """Scores a trained model; writes pictures, mesh, codes and metrics.json below run. Returns the
+    metrics, and prints those that are one number with a fraction."""
+    peak = peak_memory(scene.c2w.device)  # before scoring
+    scores, codes = evaluate(model, scene, make_lpips(), run / "held_out")
+    atomic_write(run / "codes.npy", lambda part: np.save(part, codes.cpu()))
+    write_panel(run / "panel.png", model, scene, codes)
+    if model.octrees:  # a rival has none
+        scores["octree_cells"] = model.sdf.octree.cells[:, 0].bincount().tolist()  # by level
+        write_mesh(run / "mesh.ply", model)
+        if "wall" in scene.raw:  # the toy
+            scores |= toy_truth(model, scene)
+    metrics = scores | describe_run(model, scene, state) | dict(peak_memory_bytes=peak)
     atomic_write(run / "metrics.json", lambda part: part.write_text(json.dumps(metrics, indent=1)))
     for key, value in metrics.items():
         if isinstance(value, float):
@@ -1567,24 +1785,26 @@ def finish(model, scene, state, run):
 
 
 def film(model, scene, path):
-    """mp4 at 24 frames/s: the first training camera sways sideways, by a tenth of the sphere's
-    radius, while its photo's light turns into the last photo's."""
+    """VP9, which browsers play, at 24 frames/s: the first training camera sways sideways, by a
+    tenth of the sphere's radius, while its photo's light turns into the last photo's."""
     photo, other = scene.train[[0, -1]].tolist()
     first, last = model.codes()[[photo, other]]  # (A,)
     size = scene.wh[photo].tolist()  # px; of an odd side cv2 leaves out the last pixel
-
-    def write(part):
-        video = cv2.VideoWriter(str(part), cv2.VideoWriter_fourcc(*"mp4v"), 24, size)
+    with tempfile.TemporaryDirectory() as folder:  # as cv2 cannot open every path
+        part = Path(folder, "film.mp4")
+        video = cv2.VideoWriter(str(part), cv2.VideoWriter_fourcc(*"vp09"), 24, size)
+        check(video.isOpened(), "OpenCV cannot encode VP9: pip install --upgrade "
+              "opencv-contrib-python-headless")
         for n in progress(range(96), "filming 96 frames"):
             share = n / 95
             c2w = scene.c2w.clone()
             c2w[..., 3] += 0.1 * math.sin(math.tau * share) * c2w[..., 0]
             view = scene._replace(c2w=c2w)
-            rgb, _, _ = render_photo(model, view, photo, first.lerp(last, share))
+            rgb, _, _, _ = render_photo(model, view, photo, first.lerp(last, share))
             video.write(to_uint8(rgb[..., ::-1]))
         video.release()
-        return part.stat().st_size > 0
-    atomic_write(path, write)
+        data = part.read_bytes()
+    atomic_write(path, lambda part: part.write_bytes(data))
     print(f"wrote {path}")
 
 
@@ -1613,8 +1833,8 @@ def pick_device(name):
     count = torch.cuda.device_count()
     if name == "cpu" or (name == "auto" and count == 0):
         return torch.device("cpu")
-    check(RANK < count, f"--device cuda: {count} GPUs are here for {RANKS} processes")
-    return torch.device("cuda", RANK)
+    check(LOCAL_RANK < count, f"--device cuda: {count} GPUs are here for {RANKS} processes")
+    return torch.device("cuda", LOCAL_RANK)
 
 
 def make_config(given):
@@ -1630,21 +1850,48 @@ def start_processes(device):
     check("MASTER_ADDR" in os.environ, "start processes by torchrun, or unset WORLD_SIZE")
     dist.init_process_group("cpu:gloo,cuda:nccl" if device.type == "cuda" else "gloo")
     if RANK > 0:
-        sys.stdout = open(os.devnull, "w")
+        sys.stdout = open(os.devnull, "w", errors="replace")
+
+
+def refuse_used(run):
+    """A run is hours of work: only its owner replaces it."""
+    for name in ("checkpoint.pt", "metrics.json"):
+        check(not (run / name).exists(), f"{run} holds a run already: go on with it by --resume, "
+              "train beside it by --name NAME, or delete the folder to replace it")
+
+
+@contextlib.contextmanager
+def locked(run):
+    """No other process trains in a folder meanwhile. The system ends a lock with its process."""
+    os.makedirs(run, exist_ok=True)
+    try:  # of the standard library, only SQLite locks files on every system
+        lock = sqlite3.connect(run / ".lock", timeout=0)
+        lock.executescript("PRAGMA journal_mode = OFF; BEGIN EXCLUSIVE")
+    except sqlite3.OperationalError as error:
+        raise UserError(f"{run} is in use by another training, or its disk cannot be written or "
+                        f"locked ({error}): wait, or train beside it by --name NAME")
+    with contextlib.closing(lock):
+        yield
 
 
 def main(argv=None):
     given = vars(make_parser().parse_args(argv))
     resume = given.pop("resume")
     render = given.pop("render")
+    if resume and "steps" in given:
+        given.setdefault("minutes", 0.0)  # of two budgets the last one given
     cfg = make_config(given)
     name = f"{data_prep.scene_path(cfg.source).stem}-{GeoNVS.name}-{cfg.seed}"
     run = Path("runs", cfg.name or name)
+    if render:
+        model, scene, _ = load_run(run, **given)
+        film(model, scene, run / "film.mp4")
+        return
     saved = None
-    if resume or render:
-        if "steps" in given:
-            given.setdefault("minutes", 0.0)  # of two budgets the last one given
-        saved, cfg = read_checkpoint(run / "checkpoint.pt", given)
+    if resume:
+        _, cfg = read_checkpoint(run / "checkpoint.pt", given)
+    else:
+        refuse_used(run)
     check(cfg.rays % (cfg.photos * RANKS) == 0,
           f"--rays {cfg.rays} must be a multiple of --photos {cfg.photos} times {RANKS} processes")
     device = pick_device(cfg.device)
@@ -1654,13 +1901,11 @@ def main(argv=None):
             data_prep.open_scene(cfg.source, cfg.downscale)  # the others find it made
         dist.barrier()
     scene = load_scene(data_prep.open_scene(cfg.source, cfg.downscale), device)
-    if render:
-        with device:
-            model = GeoNVS(cfg, scene)
-        restore(saved, model)
-        if RANK == 0:
-            film(model, scene, run / "film.mp4")
-    else:
+    with locked(run) if RANK == 0 else contextlib.nullcontext():
+        if resume:
+            saved, cfg = read_checkpoint(run / "checkpoint.pt", given)
+        elif RANK == 0:
+            refuse_used(run)  # what ended since is a run, too
         model, state = train(cfg, scene, run, saved)
         if RANK == 0:
             finish(model, scene, state, run)
@@ -1670,17 +1915,23 @@ def main(argv=None):
 
 def run_command_line(entry):
     """Exit code 0, or 2 with one sentence on stderr; a bug keeps its traceback."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.default_int_handler)
+    for stream in (sys.stdout, sys.stderr):  # a terminal may lack a character of a file's name
+        stream.reconfigure(errors="backslashreplace")
     try:
         entry()
         return
-    except (UserError, OSError) as error:  # a full disk, a folder without permission
+    except UserError as error:
         message = str(error)
+    except OSError as error:  # a full disk, a folder without permission
+        message = f"{error}: mend that; a run that has a checkpoint goes on with --resume"
     except (RuntimeError, MemoryError) as error:  # a CPU's allocator has no error of its own
         if isinstance(error, RuntimeError) and "allocate" not in str(error):
             raise
         message = "the memory is full: begin anew with fewer --rays or a larger --downscale"
-    except KeyboardInterrupt:
-        message = f"stopped; --resume goes on from the last checkpoint, one in {PAUSE} s"
+    except KeyboardInterrupt as stop:
+        message = str(stop) or "stopped; a run that has a checkpoint goes on with --resume"
     data_prep.warn(f"error: {message}")
     sys.exit(2)
 

@@ -1924,12 +1924,12 @@ def test_all_but_the_last_two_levels_of_the_background_are_whole(scene, levels, 
 
 def test_every_parameter_has_a_group_and_the_rate_of_its_kind(warm):
     rates = {}
-    for group, rate in zip(warm.groups(), warm.rates, strict=True):
-        rates |= dict.fromkeys(group["params"], rate)
+    for group in warm.groups():
+        rates |= dict.fromkeys(group["params"], group["base_lr"])
     for name, p in warm.named_parameters():
         wanted = warm.cfg.lr_net
         if name.startswith("mask"):
-            wanted = 8e-3
+            wanted = warm.cfg.lr_mask
         if "octree" in name:
             wanted = warm.cfg.lr_grid
         if "appearance" in name:
@@ -1988,7 +1988,7 @@ def test_refining_moves_features_and_adams_moments_along_with_their_corners(warm
 def test_mixed_precision_leaves_the_sdf_alone(warm, monkeypatch):
     batch = make_batch(warm)
     full, _, out = warm.losses(*batch, 0, generator())
-    monkeypatch.setattr(geonvs, "MIXED_ON", "cpu")
+    monkeypatch.setattr(geonvs, "has_bfloat16", lambda device_type: True)
     mixed, _, mixed_out = warm.losses(*batch, 0, generator())
     close(mixed, full, 0.01)
     assert mixed != full
@@ -2185,8 +2185,8 @@ def test_a_step_is_adams_on_the_gradient_of_its_losses(warm):
         loss, _, out = twin.losses(rays, picked, 0.0, again)
         adam.zero_grad()
         loss.backward()
-        for group, rate in zip(adam.param_groups, twin.rates):
-            group["lr"] = rate
+        for group in adam.param_groups:
+            group["lr"] = group["base_lr"]
         adam.step()
         twin.observe(rays, out)
     assert_same_tensors(warm.state_dict(), twin.state_dict())
@@ -2197,8 +2197,8 @@ def test_a_step_is_adams_on_the_gradient_of_its_losses(warm):
 def test_the_learning_rate_warms_up_and_falls_by_a_cosine(warm, step, done, share):
     optimizer = geonvs.make_optimizer(warm)
     geonvs.training_step(warm, optimizer, step, done, generator())
-    rates = [group["lr"] for group in optimizer.param_groups]
-    assert_close(rates, [share * rate for rate in warm.rates])
+    for group in optimizer.param_groups:
+        assert group["lr"] == pytest.approx(share * group["base_lr"])
 
 
 def test_a_budget_in_minutes_replaces_steps(loop):
@@ -2346,15 +2346,71 @@ def test_a_bad_checkpoint_is_refused_in_one_sentence(desk):
     assert not Path("harm").exists()
 
 
-@pytest.mark.parametrize("changes", [dict(hidden=8), dict(levels=4), dict(background="off"), {}])
-def test_a_checkpoint_of_other_settings_or_split_is_refused_and_stays(loop, changes):
+@pytest.mark.parametrize("changes", [dict(hidden=8), dict(levels=4), dict(background="off")])
+def test_a_checkpoint_of_other_settings_is_refused(loop, changes):
     run_training()
-    saved = read_saved()
-    if not changes:
-        saved["scene"]["split"] = "other.tsv"
     with pytest.raises(UserError, match="does not fit"):
-        run_training(saved, **changes)
+        run_training(read_saved(), **changes)
     assert CHECKPOINT.exists()
+
+
+@pytest.mark.parametrize("key, place, words", [
+    ("name", 1, "other.png.*toy_001.png"),
+    ("is_test", 1, "is_test of toy_001.png"),
+    ("wh", (2, 1), "wh of toy_002.png, number 1"),
+    ("K", (3, 0), "K of toy_003.png, number 0"),
+    ("c2w", (4, 2, 3), "c2w of toy_004.png, number 11"),
+    ("scale", (), "sphere of the scene, number 3")])
+def test_a_checkpoint_of_another_scene_names_the_difference(warm, scene, key, place, words):
+    raw = copy.deepcopy(scene.raw)
+    raw[key] = np.array(raw[key])
+    raw[key][place] = "other.png" if key == "name" else raw[key][place] + 1
+    saved = dict(scene=geonvs.scene_facts(scene._replace(raw=raw)))
+    with pytest.raises(UserError, match=words):
+        geonvs.restore(saved, warm)
+
+
+def test_a_checkpoint_fits_a_scene_remade_elsewhere(loop):
+    model, _ = run_training()
+    raw = model.scene.raw
+    model.scene = model.scene._replace(
+        raw=raw | dict(c2w=raw["c2w"] + 1e-9),  # another machine's rounding
+        info=dict(scene="toy", kind="colmap", folder="/elsewhere"))
+    geonvs.restore(read_saved(), model)
+
+
+def test_a_checkpoint_with_an_unknown_setting_names_it(loop):
+    run_training()
+    saved = torch.load(CHECKPOINT)
+    saved["config"]["lam_old"] = 1.0
+    torch.save(saved, CHECKPOINT)
+    with pytest.raises(UserError, match="does not know.*lam_old"):
+        read_saved()
+
+
+def test_a_resumed_run_may_have_another_learning_rate(loop):
+    run_training()
+    cfg = tiny(lr_net=1e-4)
+    model = geonvs.GeoNVS(cfg, geonvs.load_scene(toy()))
+    optimizer, _ = geonvs.restore(read_saved(), model)
+    assert optimizer.param_groups[0]["base_lr"] == 1e-4
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_stopped_run_ends_its_step_and_goes_on(desk, monkeypatch, number):
+    step = geonvs.training_step
+
+    def stop_in_step_3(*args):
+        if args[2] == 2:
+            signal.raise_signal(number)
+        return step(*args)
+    with monkeypatch.context() as patch:
+        patch.setattr(geonvs, "training_step", stop_in_step_3)
+        with pytest.raises(KeyboardInterrupt, match="step 3 is saved"):
+            run_training()
+    resumed, _ = run_training(read_saved())
+    whole, _ = run_training()
+    assert_same_tensors(resumed.state_dict(), whole.state_dict())
 
 
 def test_a_checkpoint_of_another_kind_of_device_renders_but_does_not_go_on(loop):
@@ -2373,12 +2429,15 @@ def train_as_one_of_two():
     pass_time(patch, seconds=100 - 99 * geonvs.RANK)  # each looks every 16 steps
     make_rays = mock.Mock(wraps=geonvs.make_rays)
     patch.setattr(geonvs, "make_rays", make_rays)
+    # as if records differed, which they do on GPUs
+    patch.setattr(geonvs, "worst_cells", lambda octree: octree.cells[9 * geonvs.RANK:][:9])
     model, _ = run_training(minutes=1.0, steps=99)
     pixels = [call.args[2] for call in make_rays.call_args_list]
     layer = nn.Linear(1, 1)
     layer.weight.grad = torch.full((1, 1), 1.0 + geonvs.RANK)
     geonvs.average_gradients(layer)
     weights = dict(model.named_parameters())
+    weights["split"] = model.sdf.octree.split_keys
     torch.save((weights, torch.cat(pixels), layer.weight.grad), f"{geonvs.RANK}.pt")
 
 
@@ -2508,7 +2567,7 @@ def knowing(warm):
     def render(rays, code):
         is_right = rays.uv[:, :1] > 0.48
         rgb = rays.rgb * is_right + 0 * code.sum()
-        return dict(rgb=rgb, normal=rays.d)
+        return dict(rgb=rgb, normal=rays.d, depth=rays.uv[:, 0])
 
     def logits(photos):
         people = photo(toy(), photos[0], "occluder")
@@ -2557,10 +2616,12 @@ def test_toy_truth_measures_a_known_error(knowing, scene):
 
 
 def test_a_rendered_photo_has_its_pixels_in_order(knowing, scene):
-    rgb, seen, normal = geonvs.render_photo(knowing, scene, 1, torch.zeros(4))
+    rgb, seen, normal, depth = geonvs.render_photo(knowing, scene, 1, torch.zeros(4))
+    rays = geonvs.photo_rays(scene, 1)
     assert np.array_equal(geonvs.to_uint8(seen), photo(scene.raw, 1))
     assert not rgb[:, 0].any()  # the model knows the right half
-    assert_close(normal.reshape(-1, 3), geonvs.photo_rays(scene, 1).d)
+    assert_close(normal.reshape(-1, 3), rays.d)
+    assert_close(depth.flatten(), rays.uv[:, 0])
 
 
 def test_the_mesh_of_a_ball_is_that_ball_and_faces_outwards(warm, scene):
@@ -2586,42 +2647,79 @@ def test_a_plane_of_a_mesh_ends_at_the_unit_sphere_in_cells_of_eps(warm, scene):
 
 
 @pytest.mark.parametrize("radius", [-0.1, 1.2])
-def test_a_field_without_a_surface_in_the_sphere_has_an_empty_mesh(warm, tmp_path, radius):
+def test_a_mesh_without_a_surface_is_empty(warm, tmp_path, capsys, radius):
     warm.distance = lambda x: x.norm(dim=1) - radius
     warm.cache.refresh(warm.distance)
-    mesh = geonvs.extract_mesh(warm)
-    geonvs.write_ply(tmp_path / "a.ply", *mesh)
-    assert [len(part) for part in mesh] == [0, 0]
-    assert (tmp_path / "a.ply").read_text().endswith("end_header\n")
+    path = tmp_path / "a.ply"
+    geonvs.write_mesh(path, warm)
+    assert path.read_bytes().endswith(b"end_header\n")
+    assert "mesh.ply is empty" in capsys.readouterr().out.replace("a.ply", "mesh.ply")
 
 
-def test_a_written_mesh_reads_back(tmp_path):
+def test_a_written_mesh_reads_back_exactly(tmp_path):
     rng = np.random.default_rng(0)
     vertices = rng.normal(4e5, 1.0, (5, 3))
+    colors = rng.random((5, 3))
     faces = rng.integers(0, 5, (7, 3))
-    geonvs.write_ply(tmp_path / "a.ply", vertices, faces)
-    head, body = (tmp_path / "a.ply").read_text().split("end_header\n")
-    lines = body.splitlines()
-    assert re.findall(r"element (\w+ \d)", head) == ["vertex 5", "face 7"]
-    assert_close(np.loadtxt(lines[:5]), vertices, atol=1e-3)
-    assert np.array_equal(np.loadtxt(lines[5:]), np.insert(faces, 0, 3, axis=1))
+    geonvs.write_ply(tmp_path / "a.ply", vertices, faces, colors)
+    head, body = (tmp_path / "a.ply").read_bytes().split(b"end_header\n")
+    rows = list(struct.iter_unpack("<3d3B", body[:5 * 27]))
+    corners = list(struct.iter_unpack("<B3i", body[5 * 27:]))
+    assert re.findall(rb"element (\w+ \d)", head) == [b"vertex 5", b"face 7"]
+    assert np.array_equal([row[:3] for row in rows], vertices)
+    assert_close([row[3:] for row in rows], 255 * colors, atol=0.5)
+    assert np.array_equal(corners, np.insert(faces, 0, 3, axis=1))
 
 
-@pytest.mark.parametrize("mask, count", [("on", 4), ("off", 3)])
-def test_a_panel_shows_photo_render_normals_and_a_mask_from_left_to_right(
-        warm, scene, desk, monkeypatch, mask, count):
+def test_a_vertex_has_the_colour_of_a_ray_onto_it(warm):
+    d = F.normalize(random(9, 3, low=-1))
+    x = 0.25 * d  # about on the sphere that a model starts as
+    raw = warm.scene.raw
+    colors = geonvs.mesh_colors(warm, x.numpy() * raw["scale"] + raw["center"])
+    code = warm.codes()[warm.scene.train].mean(0)
+    rays = fake_rays(3 * d, -d)
+    warm.v.data.fill_(0.8)  # a sharp surface
+    warm.background = None
+    rgb = warm.render(rays, code.expand(9, -1))["rgb"]
+    assert_close(colors, rgb.detach(), atol=0.02)
+
+
+def test_depth_is_red_near_blue_far_and_black_elsewhere():
+    depth = np.array([[1.0, 2.0, 9.0]])
+    opacity = np.array([[1.0, 1.0, 0.0]])
+    near, far, nothing = geonvs.depth_picture(depth, opacity)[0].astype(int)
+    assert near[0] > near[2] + 50
+    assert far[2] > far[0]
+    assert not nothing.any()
+
+
+@pytest.mark.parametrize("mask, count", [("on", 5), ("off", 4)])
+def test_a_panel_shows_its_columns_in_order(warm, scene, desk, monkeypatch, mask, count):
     def render_photo(model, scene, photo, code):
         assert torch.equal(code, codes[photo])
-        return [np.full((24, 16, 3), color) for color in np.eye(3) / 2]
+        pictures = [np.full((24, 16, 3), color) for color in np.eye(3) / 2]
+        return *pictures, np.zeros((24, 16))
     codes = random(8, 4)
     warm.cfg.mask = mask
     monkeypatch.setattr(geonvs, "render_photo", render_photo)
+    monkeypatch.setattr(geonvs, "depth_picture", lambda depth, _: np.full((24, 16, 3), 7, np.uint8))
     warm.mask.logits = lambda photos: torch.full((1, 1, 8, 8), -0.5)
     geonvs.write_panel(Path("a.png"), warm, scene, codes)
     panel = cv2.imread("a.png")[:, :, ::-1]
     tiles = panel.reshape(4, 380, count, 240, 3)[:, 20:]  # below the titles
-    wanted = np.array([[0, 128, 0], [128, 0, 0], [128, 128, 191], [96, 96, 96]])
-    assert (tiles == wanted[:count, None]).all()
+    wanted = [[0, 128, 0], [128, 0, 0], [128, 128, 191], [7, 7, 7], [96, 96, 96]]
+    assert (tiles == np.array(wanted[:count])[:, None]).all()
+
+
+def test_held_out_photos_are_written_beside_their_renders(knowing, scene, tmp_path):
+    geonvs.evaluate(knowing, scene, folder=tmp_path)
+    names = sorted(path.name for path in tmp_path.iterdir())
+    number = scene.test[0].item()
+    picture = cv2.imread(str(tmp_path / names[0]))[:, :, ::-1]
+    left, right = np.hsplit(picture, 2)
+    assert names == sorted(scene.raw["name"][scene.test])
+    assert np.array_equal(left, photo(scene.raw, number))
+    assert np.array_equal(right[:, -9:], left[:, -9:])  # the model knows the right half
 
 
 def test_a_film_sways_sideways_from_the_light_of_one_photo_to_anothers(
@@ -2629,7 +2727,7 @@ def test_a_film_sways_sideways_from_the_light_of_one_photo_to_anothers(
     small = odd._replace(wh=odd.wh - 1)  # a codec wants even sides
     w, h = small.wh[0].tolist()
     frame = np.full((h, w, 3), [1.0, 0, 0])
-    render_photo = mock.Mock(return_value=(frame, None, None))
+    render_photo = mock.Mock(return_value=(frame, None, None, None))
     monkeypatch.setattr(geonvs, "render_photo", render_photo)
     geonvs.film(warm, small, Path("a.mp4"))
     calls = [call.args for call in render_photo.call_args_list]
@@ -2685,13 +2783,14 @@ def test_one_command_trains_scores_and_writes_everything(command, monkeypatch):
     assert command(f"{FLAGS} --name= --seed=3 --mask=on") == (0, "")
     run = Path("runs/toy-geonvsw-3")
     metrics = json.loads((run / "metrics.json").read_text(), parse_constant=pytest.fail)
-    assert set(os.listdir(run)) == set(geonvs.RESULTS) - {"film.mp4"}
+    files = {*geonvs.PROGRESS, *geonvs.RESULTS, "held_out", ".lock"}
+    assert set(os.listdir(run)) == files - {"film.mp4"}
     assert metrics["config"] == asdict(tiny(seed=3, mask="on"))
     assert metrics["energy_wh"] in range(2, 8)  # one at the start, one for each line of the log
     assert metrics["rays_per_second"] == pytest.approx(6 * 64 / metrics["train_seconds"])
     assert metrics["commit"] is None
     assert {"psnr", "ssim", "sdf_error", "normal_error", "mask_iou"} < set(metrics)
-    assert metrics["model_bytes"] > 4 * metrics["parameters"] + 36 * sum(metrics["octree_cells"])
+    assert metrics["model_bytes"] > 4 * metrics["parameters"] + 72 * sum(metrics["octree_cells"])
     assert 1e8 < metrics["peak_memory_bytes"] < 1e11
 
 
@@ -2711,6 +2810,95 @@ def test_render_films_the_trained_model(command, monkeypatch):
     model, _, path = film.call_args.args
     assert path == RUN / "film.mp4"
     assert_same_tensors(model.state_dict(), read_saved()["model"])
+
+
+def read_files(folder):
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_a_second_run_leaves_the_first_as_it_is(command):
+    command(FLAGS)
+    before = read_files(RUN)
+    assert_refused(command(f"{FLAGS} --steps=3"), "--resume")
+    assert read_files(RUN) == before
+    assert command(f"{FLAGS} --name=b")[0] == 0
+    CHECKPOINT.unlink()
+    assert_refused(command(FLAGS), "--name")  # there are results
+
+
+def test_a_finished_run_that_is_resumed_is_scored_again(command):
+    command(FLAGS)
+    (RUN / "film.mp4").touch()
+    (RUN / "metrics.json").unlink()
+    assert command("--resume --name=a") == (0, "")
+    assert (RUN / "metrics.json").exists()
+    assert (RUN / "film.mp4").exists()
+
+
+def hold_lock():
+    with geonvs.locked(RUN):
+        print("locked", flush=True)
+        signal.pause()
+
+
+@pytest.mark.parametrize("flags", [FLAGS, "--resume --name=a"])
+def test_a_folder_is_locked_until_its_process_ends(command, flags):
+    if "resume" in flags:
+        command(FLAGS)
+    child = start_child("hold_lock")
+    assert child.stdout.readline() == "locked\n"
+    assert_refused(command(flags), "in use")
+    child.kill()
+    child.communicate()
+    assert command(flags) == (0, "")
+
+
+def test_a_run_is_loaded_in_python(command):
+    command(f"{FLAGS} --appearance=on")
+    model, scene, codes = geonvs.load_run("runs/a", device="cpu")
+    assert_same_tensors(model.state_dict(), read_saved()["model"])
+    assert np.array_equal(codes, np.load(RUN / "codes.npy"))
+    rgb, *_ = geonvs.render_photo(model, scene, scene.test[0], codes[scene.test[0]])
+    assert np.isfinite(rgb).all()
+
+
+def test_a_run_goes_on_when_its_data_were_deleted(command, monkeypatch):
+    monkeypatch.setattr(data_prep, "make_toy", toy)
+    command(FLAGS)
+    shutil.rmtree("data")
+    assert command("--resume --name=a --steps=8") == (0, "")
+
+
+def test_a_run_needs_neither_utf8_nor_resource(command, monkeypatch):
+    name = os.fsdecode(b"\xff\xe9")
+    monkeypatch.setitem(sys.modules, "resource", None)  # as on Windows
+    assert command(f"{FLAGS} --name={name}") == (0, "")
+    assert command(f"--render --name={name}") == (0, "")
+    metrics = json.loads(Path("runs", name, "metrics.json").read_text())
+    assert metrics["peak_memory_bytes"] is None
+    assert Path("runs", name, "film.mp4").stat().st_size > 1000
+
+
+def test_output_never_fails_on_a_character(monkeypatch):
+    stream = io.TextIOWrapper(io.BytesIO(), encoding="cp1252")
+    monkeypatch.setattr(sys, "stdout", stream)
+    geonvs.run_command_line(lambda: print("\u20ac\u2603"))
+    stream.flush()
+    assert stream.buffer.getvalue() == b"\x80\\u2603" + os.linesep.encode()
+
+
+def test_ctrl_c_while_libraries_load_is_one_sentence():
+    child = subprocess.Popen(
+        [sys.executable, "-X", "importtime", geonvs.__file__, "--help"],
+        stderr=subprocess.PIPE,
+        stdout=subprocess.DEVNULL,
+        text=True)
+    while "numpy" not in child.stderr.readline():
+        pass
+    child.send_signal(signal.SIGINT)
+    *_, last = child.communicate(timeout=60)[1].splitlines()
+    assert child.returncode == 2
+    assert last.startswith("error: stopped")
 
 
 @pytest.mark.parametrize("flags, word", [
@@ -2772,7 +2960,7 @@ def test_processes_must_come_from_torchrun_and_share_the_rays(command, monkeypat
     ("cpu", 2, "cpu"),
     ("auto", 0, "cpu")])
 def test_each_process_takes_its_own_gpu(monkeypatch, name, gpus, device):
-    monkeypatch.setattr(geonvs, "RANK", 1)
+    monkeypatch.setattr(geonvs, "LOCAL_RANK", 1)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: gpus)
     assert str(geonvs.pick_device(name)) == device
 
@@ -2826,11 +3014,10 @@ class Rival(nn.Module):
         super().__init__()
         self.cfg = replace(cfg, mask="off")
         self.scene = scene
-        self.rates = [cfg.lr_net]
         self.make_parts(cfg, scene)
 
     def groups(self):
-        return [dict(params=list(self.parameters()), **self.adam)]
+        return [dict(params=list(self.parameters()), base_lr=self.cfg.lr_net, **self.adam)]
 
     def do_nothing(self, *_):
         pass
@@ -2924,7 +3111,8 @@ class NeRFW(Rival):
         t, _ = torch.cat([t, t_fine], 1).sort(1)  # (R,2n)
         out = self.pass_through(self.fine, rays, t, code, other)
         normal = torch.zeros_like(out["rgb"])  # for panels
-        return out | dict(coarse=coarse["rgb"], normal=normal)
+        depth = (out["w"] * t).sum(1).detach()
+        return out | dict(coarse=coarse["rgb"], normal=normal, depth=depth)
 
     def pass_through(self, field, rays, t, code, other=None):
         """Densities to a picture: C = sum T (alpha_s c_s + alpha_t c_t). NeRF-W Eq. 5"""
@@ -3199,8 +3387,10 @@ class Splats(Rival):
             [self.feature],
             list(self.paint.parameters()),
             [self.appearance.weight]]
-        self.rates = (2e-3, 5e-2, 2e-2, 5e-2, 2e-2, 2e-3, self.cfg.lr_code)
-        return [dict(params=part, **self.adam) for part in parts]
+        rates = (2e-3, 5e-2, 2e-2, 5e-2, 2e-2, 2e-3, self.cfg.lr_code)
+        return [
+            dict(params=part, base_lr=rate, **self.adam)
+            for part, rate in zip(parts, rates)]
 
     def render(self, rays, code):
         """rgb (R,3); the rays of each photo at once, under the code of the first of them. The
@@ -3213,7 +3403,7 @@ class Splats(Rival):
             mine = rays.img == photo  # (R,)
             xy = rays.uv[mine] * self.scene.wh[photo]  # px
             rgb[mine] = self.draw(self.views[photo], code[mine][0], xy)
-        return dict(rgb=rgb, normal=torch.zeros_like(rgb))
+        return dict(rgb=rgb, normal=torch.zeros_like(rgb), depth=torch.zeros_like(rgb[:, 0]))
 
     def view(self, photo):
         """Which Gaussians a photo sees, front first (N,); their centres (N,2) px and covariances
