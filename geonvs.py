@@ -622,13 +622,16 @@ class SDFCache(nn.Module):
         voxel = torch.stack([index // n**2, index // n % n, index % n], 1)
         return voxel * (2 / (n - 1)) - 1
 
-    def refresh(self, sdf, share=1.0, turn=0):
-        """Evaluates sdf, (P,3) to (P,), again: at that share of the voxels in the sphere which is
-        nearest to the surface, and at an eighth of all, another one each turn."""
+    def refresh(self, sdf, turn=None):
+        """Evaluates sdf, (P,3) to (P,), again: at all voxels in the sphere; or, in turn 0, 1, ...,
+        at the eighth of them that is nearest to the surface and at an eighth of all, another one each turn."""
         s = self.volume[0, 0].flatten()  # (n^3,)
-        distance = s[self.inside].abs()
-        near = distance.topk(int(share * len(distance)), largest=False, sorted=False).indices
-        for index in (self.inside[near], self.inside[turn % 8::8]):
+        chosen = [self.inside]
+        if turn is not None:
+            distance = s[self.inside].abs()
+            near = distance.topk(len(distance) // 8, largest=False, sorted=False).indices
+            chosen = [self.inside[near], self.inside[turn % 8::8]]
+        for index in chosen:
             s[index] = in_chunks(sdf, self.points(index))
         s = s.view_as(self.volume[0, 0])
         self.volume[0] = torch.stack([s, *central_differences(s)])
@@ -1081,7 +1084,8 @@ class GeoNVS(nn.Module):
         most = 32 * self.cfg.samples
         self.deviation.data.clamp_(math.log(floor) / 10, math.log(most) / 10)
         if step % CACHE_EVERY == 0:
-            self.cache.refresh(self.distance, share=start / floor, turn=step // CACHE_EVERY)
+            is_soft = done < ZETA_RISE  # then the surface moves far
+            self.cache.refresh(self.distance, None if is_soft else step // CACHE_EVERY)
 
     def update_statistics(self, rays, out):
         """Remembers what refinement and the mask's threshold depend on."""
@@ -1552,15 +1556,21 @@ def evaluate(model, scene, lpips=None, folder=None):
     return scores, codes
 
 
+def mask_mean(mask, chosen):
+    """Mean of M (P,) over chosen pixels (P,); None if there are none."""
+    return float(mask[chosen].mean()) if chosen.any() else None
+
+
 def depth_edges(depth):
     """Whether depth (H,W) jumps by 5 % or more between a pixel and one of its four neighbours."""
-    depth = depth.astype(np.float32).clip(max=1e4)  # inf is sky
+    log_depth = np.log(depth.astype(np.float32).clip(max=1e4))  # inf is sky
     edges = np.zeros(depth.shape, bool)
-    for axis in (0, 1):
-        jump = np.abs(np.diff(np.log(depth), axis=axis)) > math.log(1.05)
-        before, after = np.moveaxis(edges, axis, 0)[:-1], np.moveaxis(edges, axis, 0)[1:]
-        before |= np.moveaxis(jump, axis, 0)
-        after |= np.moveaxis(jump, axis, 0)
+    jump = np.abs(np.diff(log_depth, axis=0)) > math.log(1.05)
+    edges[1:] |= jump
+    edges[:-1] |= jump
+    jump = np.abs(np.diff(log_depth, axis=1)) > math.log(1.05)
+    edges[:, 1:] |= jump
+    edges[:, :-1] |= jump
     return edges
 
 
@@ -1591,12 +1601,12 @@ def toy_truth(model, scene):
     mask = torch.cat(masks).cpu().numpy()
     is_train = np.repeat(~raw["is_test"], np.diff(raw["start"]))  # by pixel
     people = raw["occluder"][is_train]
-    edges = np.concatenate([
-        depth_edges(depth.reshape(h, w)).ravel()
-        for depth, (w, h) in zip(np.split(raw["depth"], raw["start"][1:-1]), raw["wh"])])[is_train]
-    for key, some in dict(
-            mask_static=~people, mask_edges=~people & edges, mask_flat=~people & ~edges).items():
-        truth[key] = float(mask[some].mean()) if some.any() else None
+    depths = zip(np.split(raw["depth"], raw["start"][1:-1]), raw["wh"])
+    edges = [depth_edges(depth.reshape(h, w)).ravel() for depth, (w, h) in depths]
+    edges = np.concatenate(edges)[is_train]
+    truth["mask_static"] = mask_mean(mask, ~people)
+    truth["mask_edges"] = mask_mean(mask, ~people & edges)
+    truth["mask_flat"] = mask_mean(mask, ~people & ~edges)
     if people.any():
         found = mask > 0.5
         truth["mask_iou"] = (found & people).sum() / (found | people).sum()
