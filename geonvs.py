@@ -624,7 +624,8 @@ class SDFCache(nn.Module):
 
     def refresh(self, sdf, turn=None):
         """Evaluates sdf, (P,3) to (P,), again: at all voxels in the sphere; or, in turn 0, 1, ...,
-        at the eighth of them that is nearest to the surface and at an eighth of all, another one each turn."""
+        at the eighth of them that is nearest to the surface, and at one eighth of all after the
+        other."""
         s = self.volume[0, 0].flatten()  # (n^3,)
         chosen = [self.inside]
         if turn is not None:
@@ -1043,8 +1044,8 @@ class GeoNVS(nn.Module):
 
         geometry = complexity(out["ray_e_grad"], out["ray_e_curv"])  # (R,)
         phi = edge_indicator(geometry, out["opacity"].detach(), self.mask.complexity)  # (R,)
-        reg = torch.zeros(())
-        gpl = torch.zeros(())
+        reg = error.new_zeros(())
+        gpl = error.new_zeros(())
         mask = torch.zeros_like(error)
         if cfg.mask != "off":
             logit = sample_logits(self.mask.logits(photos), rays.uv)  # (R,)
@@ -1149,7 +1150,7 @@ class GeoNVS(nn.Module):
         return self.appearance.weight.detach()
 
     def render(self, rays, code):
-        """render_rays with samples in the middle of their strata, for pictures and fitting codes."""
+        """render_rays with samples in the middle of their strata: for pictures, to fit codes."""
         middle = code.new_full((len(code), self.random_per_ray), 0.5)
         return render_rays(self, rays, code, middle, rays.o[:0])
 
@@ -1187,8 +1188,8 @@ REFINE_AT = (0.1, 0.2, 0.3, 0.45, 0.6)  # shares of training at which the octree
 PAUSE = 30  # seconds between lines of the log; a checkpoint is made with each
 PROGRESS = ("checkpoint.pt", "log.jsonl")  # what training writes
 RESULTS = ("metrics.json", "codes.npy", "panel.png", "mesh.ply", "film.mp4")  # and held_out/
-# torchrun starts RANKS processes. Each draws its own rays and follows its own quantiles, the
-# gradients are averaged, the first process decides, speaks and writes; so all hold the same weights.
+# torchrun starts RANKS processes. Each draws its own rays and follows its own quantiles; gradients
+# are averaged; the first process decides, speaks and writes; so all hold the same weights.
 RANK = int(os.environ.get("RANK", 0))
 LOCAL_RANK = int(os.environ.get("LOCAL_RANK", RANK))  # on this machine
 RANKS = int(os.environ.get("WORLD_SIZE", 1))
@@ -1507,8 +1508,8 @@ def render_photo(model, scene, photo, code):
 
 def score(rgb, truth, lpips=None):
     """The right half of a rendered photo, rounded to 8 bits, against the truth, beside a baseline
-    (psnr_floor): each row of pixels in the mean colour of its left half. SSIM: Gaussian window of 11 px,
-    sigma 1.5, no border. None where a picture is too small."""
+    (psnr_floor): each row of pixels in the mean colour of its left half. SSIM: Gaussian window
+    of 11 px, sigma 1.5, no border. None where a picture is too small."""
     half = truth.shape[1] // 2
     want = truth[:, half:]
     got = to_uint8(rgb[:, half:]) / 255
