@@ -1471,7 +1471,8 @@ def fit_codes(model, scene, photos, steps=128, n=64):
         adam.param_groups[0]["lr"] = 0.1 * 0.1 ** (step / steps)
         rays = random_rays(scene, img, gen, part=0.5)
         rgb = model.render(rays, codes.repeat_interleave(n, 0))["rgb"]
-        loss = (rgb - rays.rgb).abs().mean()
+        residual = (rgb - rays.rgb).abs() * ~rays.is_masked[:, None]  # (Bn,3)
+        loss = residual.mean()
         adam.zero_grad()
         loss.backward(inputs=codes)  # the model's weights get no gradient
         adam.step()
@@ -1580,7 +1581,8 @@ def toy_truth(model, scene):
     """What only a toy can tell. sdf_error: mean |s - s_true| near visible walls, scene units;
     normal_error: median angle at walls, degrees, by taps of 0.004. mask_iou: M > 0.5 against the
     true occluders of training photos. False positives, mean M on static pixels: mask_static of all,
-    mask_edges of those beside a jump of depth, mask_flat of the others. None without a mask."""
+    mask_edges of those beside a jump of depth, mask_flat of the others, mask_sky of the sky. None
+    without a mask."""
     raw = scene.raw
     near, sdf, wall, normal = [
         torch.as_tensor(raw[name]).to(scene.c2w)
@@ -1593,7 +1595,8 @@ def toy_truth(model, scene):
         mask_iou=None,
         mask_static=None,
         mask_edges=None,
-        mask_flat=None)
+        mask_flat=None,
+        mask_sky=None)
     if model.cfg.mask == "off":
         return truth
     masks = [
@@ -1608,6 +1611,7 @@ def toy_truth(model, scene):
     truth["mask_static"] = mask_mean(mask, ~people)
     truth["mask_edges"] = mask_mean(mask, ~people & edges)
     truth["mask_flat"] = mask_mean(mask, ~people & ~edges)
+    truth["mask_sky"] = mask_mean(mask, ~people & np.isinf(raw["depth"][is_train]))
     if people.any():
         found = mask > 0.5
         truth["mask_iou"] = (found & people).sum() / (found | people).sum()
