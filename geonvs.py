@@ -667,18 +667,13 @@ def central_differences(s):
     """E_grad and E_curv (n,n,n) of a field s (n,n,n) over [-1, 1]^3. E_curv = |lap s| h, h being
     the side of a voxel. [D2]"""
     h = 2 / (len(s) - 1)
-    padded = F.pad(s[None, None], (1,) * 6, mode="replicate")[0, 0]  # (n+2,n+2,n+2)
-    squared_slope = 0
-    second = 0
-    for axis in range(3):
-        inner = padded
-        for other in {0, 1, 2} - {axis}:
-            inner = inner.narrow(other, 1, len(s))
-        before = inner.narrow(axis, 0, len(s))
-        after = inner.narrow(axis, 2, len(s))
-        squared_slope = squared_slope + ((after - before) / (2 * h)) ** 2
-        second = second + after + before - 2 * s
-    return (squared_slope.sqrt() - 1) ** 2, second.abs() / h
+    slopes = torch.gradient(s, spacing=h)  # along x, y, z
+    lap = 0
+    for axis, slope in enumerate(slopes):
+        (second,) = torch.gradient(slope, spacing=h, dim=axis)
+        lap = lap + second
+    grad = torch.stack(slopes, -1).flatten(0, 2)  # (n^3,3)
+    return eikonal(grad).view_as(s), lap.abs() * h
 
 
 def contract(x):
