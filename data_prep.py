@@ -1,14 +1,21 @@
 """Scene files for geonvs.py: a synthetic landmark, or photos with a COLMAP reconstruction.
 
-    python data_prep.py toy --occluders 0.4     -> data/toy.npz; every knob of make_toy is a flag
-    python data_prep.py brandenburg --download  -> data/brandenburg.npz, from an archive of 5 GB
-    python data_prep.py my_photos --sfm         raw photos, by pycolmap -> data/my_photos-*.npz
+    python data_prep.py toy --occluders 0.4     a toy -> data/toy.npz
+    python data_prep.py brandenburg --download  Phototourism, 5 GB -> data/brandenburg.npz
+    python data_prep.py my_photos --sfm         photos, posed first -> data/my_photos-*.npz
     python data_prep.py my_scene                photos and a COLMAP model in it -> the same
 
-The landmark lies in the unit sphere. A ray is c2w[:, 3] + t * d with |d| = 1; a distance is this t,
-never a z-depth. Functions raise UserError, one sentence that says what to do.
+Scene files. A scene is one .npz of the arrays in FORMAT, below; some have those in OPTIONAL.
+The landmark lies in the unit sphere. A ray is c2w[:, 3] + t * d with |d| = 1; a distance
+is this t, never a z-depth. x right, y down, z forward are a camera's axes, as in OpenCV.
+
+Masks. In masks/ beside images/, the mask of photo.jpg is photo.png, photo.jpg.png or
+photo.jpg; its black pixels are left out.
+
+Functions raise UserError, one sentence that says what to do.
 """
 import argparse
+import difflib
 import gzip
 import inspect
 import io
@@ -17,14 +24,17 @@ import json
 import os
 import re
 import shutil
+import signal
 import struct
 import sys
 import tarfile
 import tempfile
 import time
+import unicodedata
 import zipfile
 import zlib
-from pathlib import Path
+from collections import defaultdict
+from pathlib import Path, PurePosixPath
 from types import SimpleNamespace
 from typing import NamedTuple
 from urllib.request import Request, urlopen
@@ -43,28 +53,36 @@ SCENES = {
 DATA = Path("data")
 ARCHIVE_URL = "https://www.cs.ubc.ca/research/kmyi_data/imw2020/TrainingData/"
 SPLIT_URL = "https://nerf-w.github.io/data/selected_images/"
-# A scene is one .npz of these arrays: I photos, J = I + 1, N pixels, K points, T observations. A
-# toy has more: depth float16 (N,), true distance, inf is sky; occluder bool (N,), by people; and
-# what toy_walls returns.
+# The arrays of a scene file: data type and shape. Scene units, unless said.
 FORMAT = dict(
-    rgb="uint8 N3",
-    start="int64 J",  # photo i is rgb[start[i]:start[i + 1]], row by row
-    wh="int32 I2",  # width, height
-    K="float64 I4",  # fx fy cx cy [px]; the first pixel's centre is at 0.5 0.5
-    c2w="float64 I34",  # camera to world; OpenCV: x right, y down, z forward
-    is_test="bool I",  # held out from training
-    name="<U I",
-    points="float32 K3",
-    center="float64 3",  # SfM units: x * scale + center
-    scale="float64",
-    track_photo="int32 T",  # sorted; this photo sees
-    track_point="int32 T",  # this point
-    track_uv="float32 T2",  # there, over wh: in 0..1 if inside
-    near="float32 I",
-    footprint="float64",
-    exposure_spread="float64",
-    bg_color="float64 3",
-    info="<U",  # JSON: scene, kind (toy or colmap), downscale, folder, split; of a toy its knobs
+    rgb=("uint8", ["pixels", 3]),  # photo i is rgb[start[i]:start[i + 1]], row by row
+    start=("int64", ["photos + 1"]),
+    wh=("int32", ["photos", 2]),  # width, height
+    K=("float64", ["photos", 4]),  # fx fy cx cy [px]; the first pixel's centre is 0.5 0.5
+    c2w=("float64", ["photos", 3, 4]),  # camera to world: x_world = c2w @ (x_camera, 1)
+    is_test=("bool", ["photos"]),  # held out from training
+    name=("<U", ["photos"]),
+    near=("float32", ["photos"]),  # distance at which the photo's content begins
+    points=("float32", ["points", 3]),  # of SfM
+    track_photo=("int32", ["sightings"]),  # sorted; this photo sees
+    track_point=("int32", ["sightings"]),  # this point
+    track_uv=("float32", ["sightings", 2]),  # there, over wh: in 0..1 if inside
+    center=("float64", [3]),  # SfM units are x * scale + center
+    scale=("float64", []),
+    footprint=("float64", []),  # a typical pixel's size on the landmark
+    exposure_spread=("float64", []),  # between training photos, of brightness in 0..1
+    bg_color=("float64", [3]),  # in 0..1, where it is one colour; else NaN
+    info=("<U", []),  # JSON: scene, kind (toy or colmap), downscale, folder, split, ...
+)
+OPTIONAL = dict(
+    masked=("bool", ["pixels"]),  # black in a mask of the photographer's: left out
+    # Of toys: the truth.
+    depth=("float16", ["pixels"]),  # distance; inf is sky
+    occluder=("bool", ["pixels"]),  # a person
+    wall=("float64", ["walls", 3]),  # visible points where the surface is smooth
+    wall_normal=("float64", ["walls", 3]),
+    near_wall=("float64", ["near walls", 3]),  # points near surfaces
+    near_wall_sdf=("float64", ["near walls"]),  # signed distance there, + outside
 )
 FAR = 1e9  # sound reconstructions have no larger number; float32 holds its square
 
@@ -82,8 +100,15 @@ def warn(message):
     print(message, file=sys.stderr)
 
 
+def allow_any_character():
+    """From now on a character that the terminal lacks is printed as its code."""
+    for stream in (sys.stdout, sys.stderr):
+        if hasattr(stream, "reconfigure"):  # a notebook's has not, and knows all
+            stream.reconfigure(errors="backslashreplace")
+
+
 def progress(items, what):
-    """Yields items; says how far it is once that took ten seconds, or a minute in a log file."""
+    """Yields items; tells how far it is after ten seconds, or a minute in a log file."""
     is_terminal = sys.stdout.isatty()
     wait = 1 if is_terminal else 60  # seconds
     due = max(10, wait)
@@ -95,14 +120,16 @@ def progress(items, what):
         is_last = done == total
         if past > due or (is_last and past > 10):
             due = past + wait
-            line = f"  {what}: {done} of {total}, {past / done * (total - done):.0f} s left "
+            left = past / done * (total - done)
+            line = f"  {what}: {done} of {total}, {left:.0f} s left "
             if is_terminal:
                 line = "\r" + line  # over the one before
-            print(line, end="" if is_terminal and not is_last else "\n", flush=True)
+            end = "" if is_terminal and not is_last else "\n"
+            print(line, end=end, flush=True)
 
 
 def atomic_write(path, write):
-    """write(temporary path), then rename: `path` is the whole old file or the whole new one."""
+    """write(temporary path), then rename: `path` is the whole old file or the new one."""
     part = path.with_name(f".{path.stem}.{os.getpid()}.{time.time_ns()}{path.suffix}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -110,13 +137,14 @@ def atomic_write(path, write):
         check(result is not False, f"cannot encode {path}")  # so cv2.imwrite says no
         part.replace(path)
     except OSError as e:
-        raise UserError(f"cannot write {path} ({e.strerror or e}): free or choose a place") from e
+        says = f"cannot write {path} ({e.strerror or e}): free or choose a place"
+        raise UserError(says) from e
     finally:
         part.unlink(missing_ok=True)
 
 
 def write_scene(path, scene):
-    """Uncompressed: a third larger, but six times faster to write and no slower to read."""
+    """Not compressed: a third larger, but six times faster to write."""
     atomic_write(path, lambda part: np.savez(part, **scene))
 
 
@@ -124,41 +152,48 @@ def refuse_bomb(path):
     """UserError for a zip file that is larger inside than outside: ours never are."""
     with zipfile.ZipFile(path) as file:
         inside = sum(member.file_size for member in file.infolist())
-        check(inside <= os.path.getsize(path), f"{path} is larger inside than outside")
+    check(inside <= os.path.getsize(path), f"{path} is larger inside than outside")
 
 
 def check_scene(scene):
     """UserError unless the arrays fit FORMAT and each other."""
-    start = scene["start"]
-    wh = scene["wh"]
-    photos = len(wh)
-    points = len(scene["points"])
-    tracks = scene["track_photo"], scene["track_point"]
-    sizes = {"2": 2, "3": 3, "4": 4, "I": photos, "J": photos + 1, "K": points, "N": start[-1],
-             "T": len(tracks[0])}
-    for key, text in FORMAT.items():
+    sizes = {
+        "photos": len(scene["wh"]),
+        "photos + 1": len(scene["wh"]) + 1,
+        "pixels": len(scene["rgb"]),
+        "points": len(scene["points"]),
+        "sightings": len(scene["track_photo"]),
+        "walls": len(scene.get("wall", ())),
+        "near walls": len(scene.get("near_wall", ())),
+    }
+    optional = {key: OPTIONAL[key] for key in OPTIONAL.keys() & scene}
+    for key, (dtype, shape) in (FORMAT | optional).items():
         value = scene[key]
-        dtype, _, letters = text.partition(" ")
-        shape = tuple(sizes[letter] for letter in letters)
+        shape = tuple(sizes.get(size, size) for size in shape)
         check(value.shape == shape and str(value.dtype).startswith(dtype), key)
-        if dtype.startswith("float") and key != "bg_color":
+        if dtype.startswith("float") and key not in ("bg_color", "depth"):
             check(np.isfinite(value).all(), key)
-    np.ravel_multi_index(tracks, (photos, points))  # ValueError if any is out of range
-    check(wh.min() > 0 and np.array_equal(start, np.cumsum([0, *wh.prod(1)])), "start")
-    check(min(scene["footprint"], scene["scale"]) > 0 and not scene["is_test"].all(), "scale")
+    for key, count in [("track_photo", sizes["photos"]), ("track_point", sizes["points"])]:
+        check((scene[key] >= 0).all() and (scene[key] < count).all(), key)
+    start = np.cumsum([0, *scene["wh"].prod(1)])
+    check(scene["wh"].min() > 0 and np.array_equal(scene["start"], start), "start")
+    check(start[-1] == sizes["pixels"], "rgb")
+    check(scene["footprint"] > 0 and scene["scale"] > 0, "scale")
+    check(not scene["is_test"].all(), "is_test")
     info = json.loads(str(scene["info"]))
     check({"kind", "scene", "downscale", "folder", "split"} <= set(info), "info")
 
 
 def read_scene(path):
-    """The dictionary of a scene file; UserError unless it is whole, and fits FORMAT and itself."""
+    """The dictionary of a scene file; UserError unless it is whole and fits FORMAT."""
     try:
         refuse_bomb(path)
         with np.load(path, allow_pickle=False) as file:
             scene = dict(file)
         check_scene(scene)
-    except Exception as e:  # a damaged file can fail in any layer: zip, array header, dtype, text
-        raise UserError(f"{path} is no whole scene, or too large: delete it, it is remade") from e
+    except Exception as e:  # a damaged file can fail in any layer: zip, header, dtype, text
+        says = f"{path} is no whole scene, or too large: delete it, it is remade"
+        raise UserError(says) from e
     return scene
 
 
@@ -668,13 +703,15 @@ def toy_walls(scene, wall, background, landmark):
         near_wall_sdf=s[is_near])
 
 
-# ---- from photos, poses and points to a scene ----------------------------------------------------
+# ---- from photos, poses and points to a scene ------------------------------------------
 def find_sphere(x, weight, tracks, is_test, contain):
     """Centre (3,) and radius of what most photos look at; its definition is [D10].
 
-    Centre: geometric median of points x (K,3) by weight. Radius: 1.1 x the distance of 95 %; if it
-    is a skyline, more than four times the median distance away, only nearer points are counted.
-    Inside are at least 30 % of the points (M,) of most training photos, and contain (...,3)."""
+    Centre: geometric median of points x (K,3) by weight. Radius: 1.1 x the distance of
+    95 %; if that is a skyline, more than four times the median distance away, only
+    nearer points are counted. Inside are at least 30 % of the points (M,) of most
+    training photos, and contain (...,3).
+    """
     centre = np.median(x, axis=0)
     for _ in range(20):  # Weiszfeld
         w = weight / np.maximum(lengths(x - centre), 1e-9)
@@ -685,23 +722,34 @@ def find_sphere(x, weight, tracks, is_test, contain):
     if np.quantile(counted, 0.95) > limit:
         counted = counted[counted <= limit]
     radius = 1.1 * np.quantile(counted, 0.95, method="inverted_cdf")
-    reach = [np.quantile(distance[own], 0.3)
-             for own, held_out in zip(tracks, is_test) if len(own) and not held_out]
-    check(reach, "no training photo observes a usable 3D point: they do not belong together")
+    reach = [
+        np.quantile(distance[own], 0.3)
+        for own, held_out in zip(tracks, is_test)
+        if len(own) and not held_out
+    ]
+    check(
+        reach,
+        "no training photo observes a usable 3D point: they do not belong together")
     corners = lengths(np.reshape(contain, (-1, 3)) - centre)
     radius = max(radius, np.median(reach), *1.02 * corners)
     check(radius > 1 / FAR, "all 3D points coincide: run SfM again")
     return centre, radius
 
 
-def build_scene(images, K, c2w, is_test, name, points, tracks, info, contain=()):
-    """The scene of images (h,w,3), each of which observes the points tracks (M,). SfM units: c2w;
-    points (K,5): x y z, error [px], views; contain (...,3)."""
+def build_scene(
+        images, K, c2w, is_test, name, points, tracks, info, contain=(), masks=None):
+    """The scene of images (h,w,3), each of which sees the points tracks (M,).
+
+    SfM units: c2w; points (K,5): x y z, error [px], views; contain (...,3).
+    masks: of each photo (h,w) bool, True is left out.
+    """
     error, views = points[:, 3:].T
     usable = views >= 3
     if usable.sum() < 500:
         usable = views >= 2
-    check(usable.sum() >= 20, f"{usable.sum()} usable 3D points: SfM needs more overlapping photos")
+    check(
+        usable.sum() >= 20,
+        f"{usable.sum()} usable 3D points: SfM needs more overlapping photos")
     usable &= error <= np.quantile(error[usable], 0.95)
     new_index = np.cumsum(usable) - 1
     tracks = [new_index[own[usable[own]]] for own in tracks]
@@ -714,23 +762,39 @@ def build_scene(images, K, c2w, is_test, name, points, tracks, info, contain=())
     arrays = dict(
         rgb=np.concatenate([image.reshape(-1, 3) for image in images]),
         start=np.cumsum([0, *wh.prod(1)]),
-        wh=wh, K=K, c2w=c2w, is_test=is_test, name=name, info=json.dumps(info),
-        points=(x - centre) / radius, center=centre, scale=radius,
-        track_photo=np.repeat(np.arange(len(wh)), list(map(len, tracks))),
-        track_point=np.concatenate(tracks))
-    scene = {key: np.asarray(value, FORMAT[key].split()[0]) for key, value in arrays.items()}
+        wh=wh,
+        K=K,
+        c2w=c2w,
+        is_test=is_test,
+        name=name,
+        points=(x - centre) / radius,
+        track_photo=np.repeat(np.arange(len(wh)), [len(own) for own in tracks]),
+        track_point=np.concatenate(tracks),
+        center=centre,
+        scale=radius,
+        info=json.dumps(info))
+    scene = {}
+    for key, value in arrays.items():
+        dtype, _ = FORMAT[key]
+        scene[key] = np.asarray(value, dtype)
+    if masks:
+        scene["masked"] = np.concatenate([mask.ravel() for mask in masks])
     return add_statistics(scene)
 
 
 def add_statistics(scene):
-    """Adds what geonvs.py decides by. near (I,): 0.8 x the 2 % quantile of the distances of a
-    photo's points, >= 0.02. Of the training photos: footprint, lower quartile of a pixel's size at
-    points in the sphere; exposure_spread, deviation of brightness (0..1) at equal points; bg_color
-    (3,), beyond the sphere; NaN unless 60 % agree."""
+    """Adds the arrays of FORMAT that geonvs.py decides by.
+
+    near: 0.8 x the 2 % quantile of the distances of a photo's points, >= 0.02. Of the
+    training photos, without masked pixels: footprint, lower quartile of a pixel's size at
+    points in the sphere; exposure_spread, deviation of brightness at equal points;
+    bg_color, seen by rays that miss the sphere, NaN unless 60 % agree.
+    """
     rgb = scene["rgb"]
+    masked = scene.get("masked", np.zeros(len(rgb), bool))
     step = max(1, len(rgb) // 500_000)
     near, places = [], []  # of all photos
-    observed, size, bright, beyond = [], [], [], []  # of the training photos
+    observed, sizes, brightness, background = [], [], [], []  # of the training photos
     photos = zip(scene["start"], scene["K"], scene["c2w"], scene["wh"])
     for i, (first, K, c2w, wh) in enumerate(photos):
         own = scene["track_point"][scene["track_photo"] == i]
@@ -740,35 +804,40 @@ def add_statistics(scene):
         near.append(max(0.8 * np.quantile(distance, 0.02), 0.02) if len(own) else 0.05)
         if scene["is_test"][i]:
             continue
-        at = np.clip(uv, 0, wh - 1).astype(int) @ (1, wh[0])
-        observed.append(own)
-        size.append(distance[lengths(x) < 1] / K[0])
-        bright.append(rgb[first + at].mean(1) / 255)
+        sizes.append(distance[lengths(x) < 1] / K[0])
+        pixel = first + np.clip(uv, 0, wh - 1).astype(int) @ (1, wh[0])
+        is_seen = ~masked[pixel]
+        observed.append(own[is_seen])
+        brightness.append(rgb[pixel[is_seen]].mean(1) / 255)
         o = c2w[:, 3]
         d = ray_directions(K, c2w, *wh)
         closest = o - np.minimum(d @ o, 0)[:, None] * d  # to the centre, along each ray
-        misses = np.flatnonzero(lengths(closest) > 1)
-        beyond.append(rgb[first + misses[::step]])
-    every = np.concatenate(observed)
-    mean = np.bincount(every, np.concatenate(bright)) / np.maximum(np.bincount(every), 1)  # (K,)
-    offsets = [np.median(b - mean[own]) for b, own in zip(bright, observed) if len(own)]
-    beyond = np.concatenate(beyond)
+        is_miss = lengths(closest) > 1
+        is_miss &= ~masked[first:first + len(d)]
+        background.append(rgb[first + np.flatnonzero(is_miss)[::step]])
+    points = np.concatenate(observed)
+    mean = np.bincount(points, np.concatenate(brightness))
+    mean /= np.maximum(np.bincount(points), 1)  # (K,)
+    offsets = [
+        np.median(b - mean[own]) for b, own in zip(brightness, observed) if len(own)]
+    background = np.concatenate(background)
     color = np.full(3, np.nan)
-    if len(beyond) > 100:  # fewer may all be people
-        typical = np.median(beyond, 0)
-        agree = (abs(beyond - typical) < 5.1).all(1)
+    if len(background) > 100:  # fewer may all be people
+        typical = np.median(background, 0)
+        agree = (abs(background - typical) < 5.1).all(1)
         if agree.mean() > 0.6:
             color = typical / 255
     return scene | dict(
         near=np.float32(near),
         track_uv=np.concatenate(places, dtype=np.float32),
-        footprint=np.quantile(np.concatenate(size), 0.25),
-        exposure_spread=np.std(offsets),
+        footprint=np.quantile(np.concatenate(sizes), 0.25),
+        exposure_spread=np.std(offsets) if offsets else np.float64(0),
         bg_color=color)
 
 
-# ---- folders with photos and COLMAP models -------------------------------------------------------
-PHOTO_TYPES = ".jpg .jpeg .png .tif .tiff .bmp .webp .ppm .pgm .jp2 .avif .heic".split()
+# ---- folders with photos, masks and COLMAP models --------------------------------------
+PHOTO_TYPES = (
+    ".jpg .jpeg .png .tif .tiff .bmp .webp .ppm .pgm .jp2 .avif .heic .heif".split())
 # COLMAP's camera models in the order of their numbers, with their parameters.
 CAMERA_MODELS = dict(
     SIMPLE_PINHOLE="f cx cy",
@@ -795,9 +864,11 @@ OPENCV_DISTORTION = "k1 k2 p1 p2 k3 k4 k5 k6".split()
 
 
 def open_binary(path):
-    """A function that reads the next values of a little-endian file, by a layout of struct's."""
-    check(path.is_file(),
-          f"{path} is missing: copy the whole model, or for points run colmap point_triangulator")
+    """A function that reads the next values of a little-endian file, by struct's layouts."""
+    check(
+        path.is_file(),
+        f"{path} is missing: copy the whole model, or for points run "
+        "colmap point_triangulator")
     file = io.BytesIO(path.read_bytes())
 
     def read(layout):
@@ -805,53 +876,73 @@ def open_binary(path):
             record = struct.Struct("<" + layout)
             return record.unpack(file.read(record.size))
         except struct.error as e:  # too few bytes are left, or none could be enough
-            raise UserError(f"{path} ends too early: copy it again, or delete its folder") from e
+            says = f"{path} ends too early: copy it again, or delete its folder"
+            raise UserError(says) from e
     return read
 
 
-def read_photos(sparse):
-    """{name: (camera, pose (7,), ids of points)} of a COLMAP model. camera: wh, K (4,), k1 k2 p1 p2
-    k3 .. k6 of OpenCV; None if it is missing, a fisheye or of another unknown kind."""
-    cameras, photos = {}, {}
+def read_cameras(sparse):
+    """{number: (wh, K (4,), OPENCV_DISTORTION (8,))} of a model's perspective cameras."""
+    cameras = {}
     read = open_binary(sparse / "cameras.bin")
-    for _ in range(*read("Q")):
-        key, model, *wh = read("IiQQ")
-        check(0 <= model < len(CAMERA_MODELS),
-              f"{sparse} has camera model {model}, which is unknown: run colmap image_undistorter")
-        kind, names = list(CAMERA_MODELS.items())[model]
+    (count,) = read("Q")
+    for _ in range(count):
+        number, kind, *wh = read("IiQQ")
+        check(
+            0 <= kind < len(CAMERA_MODELS),
+            f"{sparse} has camera model {kind}, which is unknown: run "
+            "colmap image_undistorter")
+        kind, names = list(CAMERA_MODELS.items())[kind]
         names = names.split()
         value = dict(zip(names, read(f"{len(names)}d")))
         if kind in PERSPECTIVE:
             f = value.get("f")
             K = [value.get("fx", f), value.get("fy", f), value["cx"], value["cy"]]
-            distortion = [value.get(key, 0.0) for key in OPENCV_DISTORTION]
-            cameras[key] = wh, np.array(K), np.array(distortion)
+            distortion = [value.get(name, 0.0) for name in OPENCV_DISTORTION]
+            cameras[number] = wh, np.array(K), np.array(distortion)
+    return cameras
+
+
+def read_photos(sparse):
+    """{name: (camera or None, pose (7,), ids of its points)} of a COLMAP model."""
+    cameras = read_cameras(sparse)
+    photos = {}
     read = open_binary(sparse / "images.bin")
-    for _ in range(*read("Q")):
+    (count,) = read("Q")
+    for _ in range(count):
         _, *pose, camera = read("I7dI")
         letters = iter(lambda: read("c")[0], b"\0")
-        name = b"".join(letters).decode(errors="replace").replace("\\", "/")  # of Windows
-        (count,) = read("Q")
-        ids = read(f"{3 * count}Q")[2::3]  # of u, v, point
-        check(name not in photos and not {"", ".."} & set(name.split("/")),
-              f"{sparse}: photo {name!r} occurs twice or lies outside the image folder: rename it")
+        name = b"".join(letters).decode(errors="surrogateescape")
+        name = name.replace("\\", "/")  # of Windows
+        (sightings,) = read("Q")
+        ids = read(f"{3 * sightings}Q")[2::3]  # of u, v, point
+        check(
+            name not in photos and not {"", ".."} & set(name.split("/")),
+            f"{sparse}: photo {name!r} occurs twice or lies outside the image folder: "
+            "rename it")
         photos[name] = cameras.get(camera), np.array(pose), ids
     return photos
 
 
 def check_photo(camera, pose, is_test):
     """UserError, a sentence about the photo, unless it can be used."""
-    check(camera, "has no camera in the model, or a fisheye: run colmap image_undistorter")
+    check(
+        camera,
+        "has no camera in the model, or a fisheye: run colmap image_undistorter")
     wh, K, distortion = camera
     numbers = np.concatenate([K, distortion, pose])
     is_sound = (abs(numbers) < FAR).all() and min(K[:2]) > 1 / FAR and pose[:4].any()
-    check(is_sound and max(wh) < 32767, "has no sound camera or pose: run SfM again")
+    check(
+        is_sound and max(wh) < 32767,
+        "has no sound camera or pose: run SfM again")
     angle = 2 * np.degrees(np.arctan(max(wh / K[:2]) / 2))
-    check(is_test or 10 <= angle <= 120, f"is {angle:.1f} degrees wide, which is not in 10..120")
+    check(
+        is_test or 10 <= angle <= 120,
+        f"is {angle:.1f} degrees wide, which is not in 10..120")
 
 
 def camera_to_world(pose):
-    """COLMAP's rotation from world to camera, a quaternion, and translation (7,) -> c2w (3,4)"""
+    """COLMAP's world to camera, quaternion and translation (7,) -> c2w (3,4)"""
     w, *v = pose[:4] / norm(pose[:4])  # old files are not normalised
     turn = np.cross(v, np.eye(3))
     R = np.eye(3) + 2 * w * turn + 2 * turn @ turn
@@ -860,68 +951,144 @@ def camera_to_world(pose):
 
 def read_points(sparse):
     """Points (K,5) of a COLMAP model, as in build_scene, and {id: row} of them."""
-    read = open_binary(sparse / "points3D.bin")
     points, rows = [], {}
-    for _ in range(*read("Q")):
+    read = open_binary(sparse / "points3D.bin")
+    (count,) = read("Q")
+    for _ in range(count):
         key, x, y, z, *_, error, views = read("Q3d3BdQ")
         read(f"{2 * views}I")  # the track: photos list their points
         rows[key] = len(points)
         points.append((x, y, z, error, views))
     points = np.array(points, float).reshape(-1, 5)
     points[~(abs(points) < FAR).all(1)] = 0  # nan as well: nobody sees them
-    check((points[:, 4] > 1).any(),
-          f"no point of {sparse} has a track: run colmap point_triangulator on it")
+    check(
+        (points[:, 4] > 1).any(),
+        f"no point of {sparse} has a track: run colmap point_triangulator on it")
     return points, rows
 
 
-def below(folder, name):
-    """Paths of that name, at most six levels down; links are followed, unlike by rglob."""
-    found = []
-    for depth in range(7):
-        found += sorted(folder.glob("*/" * depth + name))
-    return found
+def files_below(folder, levels=7):
+    """Files at most so many levels down, without hidden folders and thumbnails.
+
+    Links are followed, unlike by rglob; broken ones are files.
+    """
+    files = []
+    if levels and folder.is_dir():
+        for path in sorted(folder.iterdir()):
+            if path.name.startswith((".", "@")):  # NAS boxes write @eaDir
+                continue
+            files += files_below(path, levels - 1) if path.is_dir() else [path]
+    return files
 
 
 def photo_files(folder):
-    """{name: path} of the photos below a folder; dense/ holds copies of those outside it."""
+    """{name: path} of the photos below a folder, without masks/ and copies in dense/."""
     files = {}
-    for path in below(folder, "[!.]*"):
+    for path in files_below(folder):
         name = path.relative_to(folder)
-        if path.suffix.lower() in PHOTO_TYPES and name.parts[0] != "dense":
+        is_photo = path.suffix.lower() in PHOTO_TYPES
+        if is_photo and name.parts[0] not in ("dense", "masks"):
             files[name.as_posix()] = path
     return files
 
 
+def mask_files(images, names):
+    """{photo: path of its mask}; masks/ lies beside the folder of photos or in it."""
+    folder = images / "masks"
+    if not folder.is_dir():
+        folder = images.parent / "masks"
+    files = {path.relative_to(folder).as_posix(): path for path in files_below(folder)}
+    masks = {}
+    for name in names:
+        other = str(PurePosixPath(name).with_suffix(".png"))
+        for candidate in (other, name + ".png", name):
+            if candidate in files:
+                masks[name] = files[candidate]
+                break
+    if files and not masks:
+        warn(f"{folder} is not used: no name in it, such as {min(files)}, is a photo's")
+    return masks
+
+
+def match_names(wanted, there):
+    """{wanted name: its name there}: equal, or else equal but for case and Unicode form.
+
+    The latter only if no second name is alike.
+    """
+    found = {name: name for name in wanted if name in there}
+    alike = defaultdict(lambda: ([], []))
+    for side, names in enumerate([set(wanted) - found.keys(), set(there) - found.keys()]):
+        for name in names:
+            plain = unicodedata.normalize("NFC", name).casefold()
+            alike[unicodedata.normalize("NFC", plain)][side].append(name)
+    for ours, theirs in alike.values():
+        if len(ours) == len(theirs) == 1:
+            found[ours[0]] = theirs[0]
+    return found
+
+
+def nearest(name, names):
+    """A hint at the name that may be meant, or nothing."""
+    stem = PurePosixPath(name).stem
+    close = [other for other in names if PurePosixPath(other).stem == stem]
+    close += difflib.get_close_matches(name, names, 1)
+    return f"; there is {close[0]!r}" if close else ""
+
+
 def open_model(folder, sparse):
-    """A model with that folder of photos around it in which most of its photos are."""
+    """A model, with that folder around it in which most of its photos are."""
     photos = read_photos(sparse)
     places = []
     for place in (sparse, *sparse.parents):
         places += [place / "images", place / "input", place]
         if place == folder:
             break
-    images = max(places, key=lambda place: len(photos.keys() & photo_files(place)))
-    files = photo_files(images)
-    names = sorted(photos.keys() & files)  # posed, and on disk
-    count = sum(photos[name][0] is not None for name in names)  # with a camera
+    on_disk = [photo_files(place) for place in places]
+    matches = [match_names(photos, files) for files in on_disk]
+    best = max(range(len(places)), key=lambda i: len(matches[i]))
+    files = {name: on_disk[best][other] for name, other in matches[best].items()}
+    usable = [name for name in files if photos[name][0] is not None]  # with a camera
     return SimpleNamespace(
-        sparse=sparse, photos=photos, images=images, files=files, names=names, count=count)
+        sparse=sparse,
+        photos=photos,
+        images=places[best],
+        on_disk=list(on_disk[best]),
+        files=files,  # of the photos that are posed, and on disk
+        count=len(usable))
+
+
+def model_folders(folder):
+    return [path.parent for path in files_below(folder) if path.name == "images.bin"]
 
 
 def find_model(folder, command):
-    """The model in the folder with most photos; says what that leaves out."""
-    models = [open_model(folder, path.parent) for path in below(folder, "images.bin")]
-    check(models, f"{folder} has no binary COLMAP model: run python data_prep.py {command}, or for "
-          "a text model colmap model_converter --output_type BIN")
+    """The model in the folder with most photos; tells what that leaves out."""
+    models = [open_model(folder, sparse) for sparse in model_folders(folder)]
+    if not models and folder.name in ("images", "input"):
+        parent = Path(os.path.abspath(folder)).parent
+        check(
+            not model_folders(parent),
+            f"{folder} has no COLMAP model, the folder around it has: give {parent}")
+    check(
+        models,
+        f"{folder} has no binary COLMAP model: run python data_prep.py {command}, or for a "
+        "text model colmap model_converter --output_type BIN")
     best = max(models, key=lambda model: model.count)
+    check(
+        best.photos,
+        f"{best.sparse} is an empty model, no photo is posed: delete it and run "
+        f"python data_prep.py {command}")
     lost = sorted(best.photos.keys() - best.files)
-    says = f"{len(lost)} photos of {best.sparse} are not on disk, such as {lost[:1]}"
-    check(best.names,
-          f"{says}: put them into {folder}/images, or run python data_prep.py {command}")
     if lost:
+        hint = nearest(lost[0], best.on_disk)
+        says = f"{len(lost)} photos of {best.sparse} are not on disk, such as {lost[0]!r}{hint}"
+        check(
+            best.files,
+            f"{says}: put them into {folder / 'images'}, or run "
+            f"python data_prep.py {command}")
         warn(says)
-    on_disk = max(len(model.files) for model in models)
-    print(f"{best.images}: {on_disk} photos on disk, {len(best.names)} posed by {best.sparse}")
+    print(f"{best.images}: {max(len(model.on_disk) for model in models)} photos on disk, "
+          f"{len(best.files)} posed by {best.sparse}")
     for model in models:
         if model.photos.keys() != best.photos.keys():
             print(f"left out is another model: {len(model.photos)} posed by {model.sparse}")
@@ -931,125 +1098,252 @@ def find_model(folder, command):
 def read_table(path):
     """Lines of a table of any separator, as lists of words."""
     check(path.is_file(), f"the split file {path} is missing")
-    text = path.read_text("utf-8-sig", "replace")
+    text = path.read_text("utf-8-sig", "surrogateescape")
     lines = [line for line in text.splitlines() if line.strip()] or [""]
-    mark = max("\t;,", key=lines[0].count)
-    return [[word.strip(' "') for word in line.split(mark)] for line in lines]
+    separator = max("\t;,", key=lines[0].count)
+    return [[word.strip(' "') for word in line.split(separator)] for line in lines]
 
 
-def read_split(path):
-    """{name: whether it is held out} of a table with NeRF-W's columns, without the rows with an
-    empty id; or of train_list.txt and test_list.txt, one of which is `path`."""
-    head, *rows = read_table(path)
-    if path.suffix == ".txt":
-        head = ["filename", "split"]
-        rows = []
-        for part in ("train", "test"):
-            names = read_table(path.with_name(re.sub("train|test", part, path.name)))
-            rows += [(name, part) for name, *_ in names]
-    check({"filename", "split"} <= set(head), f"{path} needs a header with filename and split")
-    held_out = {}
-    for words in rows:
-        row = dict(zip(head, words))
-        name, part = row.get("filename"), row.get("split")
-        if row.get("id") == "":
-            continue
-        is_test = part == "test"
-        is_sound = name and part in ("train", "test") and held_out.get(name, is_test) == is_test
-        check(is_sound, f"{path}: {name!r} is {part!r}; each is train or test, and not both")
-        held_out[name] = is_test
-    return held_out
-
-
-def fingerprint(info):
-    """Of names, sizes and times of all files that a scene is read from."""
-    folder = Path(info["folder"])
-    paths = [*photo_files(Path(info["images"])).values(), *folder.glob("*.*")]
-    for path in below(folder, "images.bin"):
-        paths += path.parent.glob("*.bin")
-    if info["split"]:
-        paths.append(Path(info["split"]))
-    checksum = 0
-    for path in sorted(paths):
-        if path.exists():
-            line = f"{path} {path.stat().st_size} {path.stat().st_mtime_ns}\n"
-            checksum = zlib.crc32(os.fsencode(line), checksum)
-    return checksum
-
-
-def read_photo(path, camera, downscale):
-    """Unturned as COLMAP has it, undistorted, then reduced. -> rgb uint8 (h,w,3), K (4,)"""
-    (w, h), K, distortion = camera
-    check(1 <= downscale <= min(w, h) / 2, f"is {w} x {h}: choose another --downscale")
-    data = path.read_bytes()
-   # OpenCV says nothing where a file is cut off. A JPEG has an end mark after its last scan.
-    is_cut_jpeg = data[:2] == b"\xff\xd8" and data.rfind(b"\xff\xd9") < data.rfind(b"\xff\xda")
-    is_cut_png = data[1:4] == b"PNG" and b"IEND" not in data
-    check(not is_cut_jpeg and not is_cut_png, "is cut off: copy it again")
-    try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8),
-                             cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-    except cv2.error:  # empty, or more than a gigapixel
-        image = None
-    check(image is not None,
-          "is empty, damaged, too large or no photo of a known type: replace it")
-    size = image.shape[1::-1]
-    check(size == (w, h),
-          f"has {size[0]} x {size[1]} pixels, its camera {w} x {h}: put back what SfM saw")
-    if distortion.any():
-        places = [0, 1, 0, 1], [0, 1, 2, 2]  # of fx fy cx cy in a matrix
-        corner = 0, 0, 0.5, 0.5  # OpenCV's first pixel is at 0
-        M = np.eye(3)
-        M[places] = K - corner
-        P, _ = cv2.getOptimalNewCameraMatrix(M, distortion, (w, h), 0)  # shows nothing but photo
-        image = cv2.undistort(image, M, distortion, None, P)
-        K = P[places] + corner
-    small = w // downscale, h // downscale
-    image = cv2.resize(image, small, interpolation=cv2.INTER_AREA)
-    return image[..., ::-1], K * (small * 2) / (w, h, w, h)
-
-
-def choose_parts(folder, names, split):
-    """{name: whether it is held out} of the photos that are to be used, by the split file named or
-    found in the folder, which may be one of two lists; says by which rule."""
-    tables = sorted(folder.glob("[!.]*.[ct]sv"))
-    tables = [path for path in tables if "split" in read_table(path)[0]]
+def split_files(folder, split):
+    """The table of the split, or train_list.txt and test_list.txt: named or in the folder."""
+    tables = [
+        path for path in sorted(folder.glob("[!.]*.[ct]sv"))
+        if "split" in read_table(path)[0]
+    ]
     if not tables:
         tables = list(folder.glob("train*.txt"))
     if split:
         tables = [Path(split)]
-    check(len(tables) < 2, f"choose a split file by --split: {', '.join(map(str, tables))}")
+    check(
+        len(tables) < 2,
+        f"choose a split file by --split: {', '.join(map(str, tables))}")
+    if tables and tables[0].suffix == ".txt":
+        name = tables[0].name
+        tables = [
+            tables[0].with_name(re.sub("train|test", part, name))
+            for part in ("train", "test")
+        ]
+    return tables
+
+
+def read_split(tables):
+    """{name: whether it is held out} of what split_files finds.
+
+    A table has NeRF-W's columns; rows with an empty id do not count.
+    """
+    path = tables[0]
+    if len(tables) == 2:
+        head = ["filename", "split"]
+        rows = [
+            (name, part)
+            for part, path in zip(("train", "test"), tables)
+            for name, *_ in read_table(path)
+        ]
+    else:
+        head, *rows = read_table(path)
+    check(
+        {"filename", "split"} <= set(head),
+        f"{path} needs a header with filename and split")
+    held_out = {}
+    for words in rows:
+        row = dict(zip(head, words))
+        if row.get("id") == "":
+            continue
+        name = row.get("filename")
+        part = row.get("split")
+        is_test = part == "test"
+        check(
+            name and part in ("train", "test") and held_out.get(name, is_test) == is_test,
+            f"{path}: {name!r} is {part!r}; each is train or test, and not both")
+        held_out[name] = is_test
+    return held_out
+
+
+def choose_parts(folder, names, tables):
+    """{name: whether it is held out} of the photos that are to be used; tells the rule."""
     if not tables:
         print(f"{folder} has no split file: every eighth photo is held out")
         return {name: i % 8 == 7 for i, name in enumerate(names)}
-    held_out = read_split(tables[0])
     print(f"split by {tables[0]}")
+    held_out = read_split(tables)
+    matches = match_names(held_out, names)
+    held_out = {matches.get(name, name): part for name, part in held_out.items()}
     rest = set(names) - held_out.keys()
     if rest:
         warn(f"{len(rest)} photos are not in {tables[0]}: {min(rest)} ...")
     return held_out
 
 
-def read_usable(model, rows, held_out, downscale):
-    """{name: (rgb, K, c2w, rows of its points)} of the photos that can be used; says which cannot,
-    and why."""
+def checksum(paths, start=0):
+    """Of the content of those files that exist."""
+    for path in paths:
+        if path.is_file():
+            start = zlib.crc32(path.read_bytes(), start)
+    return start
+
+
+def photos_checksum(files, masks, start=0):
+    """Of the photos' names and content, and of their masks. files, masks: {name: path}"""
+    for name in sorted(files):
+        start = zlib.crc32(os.fsencode(name), start)
+        paths = [files[name]]
+        if name in masks:
+            paths.append(masks[name])
+        start = checksum(paths, start)
+    return start
+
+
+def fingerprint(info):
+    """Of the content of all files that a scene is read from, wherever they lie."""
+    folder = Path(info["folder"])
+    images = Path(info["images"])
+    models = [
+        sparse / name
+        for sparse in model_folders(folder)
+        for name in ("cameras.bin", "images.bin", "points3D.bin")
+    ]
+    there = photo_files(images)
+    files = {
+        name: there[other] for name, other in match_names(info["posed"], there).items()}
+    masks = mask_files(images, files)
+    start = checksum([*models, *split_files(folder, info["split"])])
+    return photos_checksum(files, masks, start)
+
+
+def is_heic(data):
+    return data[4:8] == b"ftyp" and data[8:12] in (b"heic", b"heix", b"mif1", b"msf1")
+
+
+def decode(data, flags):
+    """Image of OpenCV; None unless it is one."""
+    try:
+        return cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    except cv2.error:  # empty, or more than a gigapixel
+        return None
+
+
+def undistort(image, camera):
+    """An image (h,w) or (h,w,3) as a pinhole camera sees it, and its K (4,)."""
+    wh, K, distortion = camera
+    if not distortion.any():
+        return image, K
+    fx, fy, cx, cy = K - (0, 0, 0.5, 0.5)  # OpenCV's first pixel is at 0
+    M = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    P, _ = cv2.getOptimalNewCameraMatrix(M, distortion, wh, 0)  # 0: nothing but photo
+    image = cv2.undistort(image, M, distortion, None, P)
+    return image, np.array([P[0, 0], P[1, 1], P[0, 2] + 0.5, P[1, 2] + 0.5])
+
+
+def read_photo(path, camera, downscale):
+    """As COLMAP has it, undistorted, then reduced. -> rgb uint8 (h,w,3), K (4,)"""
+    w, h = camera[0]
+    check(1 <= downscale <= min(w, h) / 2, f"is {w} x {h}: choose another --downscale")
+    check(path.is_file(), "is a broken link: copy the photo itself")
+    data = path.read_bytes()
+    check(not is_heic(data), "is HEIC, which cannot be read: convert it to JPEG")
+    # OpenCV is silent where a file is cut off. A JPEG has an end mark after its last scan.
+    is_cut_jpeg = (
+        data[:2] == b"\xff\xd8" and data.rfind(b"\xff\xd9") < data.rfind(b"\xff\xda"))
+    is_cut_png = data[1:4] == b"PNG" and b"IEND" not in data
+    check(not is_cut_jpeg and not is_cut_png, "is cut off: copy it again")
+    image = decode(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    check(
+        image is not None,
+        "is empty, damaged, too large or no photo of a known type: replace it")
+    stored = image.shape[1::-1]
+    if stored != (w, h):
+        image = decode(data, cv2.IMREAD_COLOR)
+    size = image.shape[1::-1]
+    tag = "" if size == stored else f", {size[0]} x {size[1]} by its EXIF orientation tag"
+    check(
+        size == (w, h),
+        f"has {stored[0]} x {stored[1]} pixels{tag}, its camera {w} x {h}: put back what "
+        "SfM saw")
+    image, K = undistort(image, camera)
+    small = w // downscale, h // downscale
+    image = cv2.resize(image, small, interpolation=cv2.INTER_AREA)
+    return image[..., ::-1], K * (small * 2) / (w, h, w, h)
+
+
+def read_mask(path, size):
+    """A mask in its photo's size (w, h). -> uint8 (h,w): 0 is left out, 255 is not"""
+    mask = decode(path.read_bytes(), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+    check(mask is not None, "is no image")
+    mask = np.where(mask < 128, 0, 255).astype(np.uint8)
+    h, w = mask.shape
+    check(
+        abs(w * size[1] / (h * size[0]) - 1) < 0.02,
+        f"has {w} x {h} pixels, its photo {size[0]} x {size[1]}")
+    check(mask.any(), "is black all over; 255 is white")
+    return cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST)
+
+
+def read_masks(model, usable):
+    """Of each usable photo, which pixels are left out: a list of (h,w) bool, or None."""
+    paths = mask_files(model.images, usable)
+    masks = []
+    used = 0
+    for name, (image, *_) in usable.items():
+        h, w = image.shape[:2]
+        masked = np.zeros((h, w), bool)
+        if name in paths:
+            camera = model.photos[name][0]
+            try:
+                mask, _ = undistort(read_mask(paths[name], camera[0]), camera)
+                mask = cv2.resize(mask, (w, h), interpolation=cv2.INTER_AREA)
+                masked = mask < 128
+                used += 1
+            except UserError as e:
+                warn(f"mask not used: {paths[name]} {e}")
+        masks.append(masked)
+    if not used:
+        return None
+    black = np.mean(np.concatenate([masked.ravel() for masked in masks]))
+    print(f"{used} of {len(masks)} photos have a mask: {black:.0%} of all pixels are black "
+          "and left out")
+    return masks
+
+
+def read_usable(model, points, rows, held_out, downscale):
+    """{name: (rgb, K, c2w, rows of its points)} of the photos that can be used.
+
+    Tells which cannot, and why.
+    """
     usable = {}
+    misfits = {}  # photos that miss most of the points that they should see
     for name in progress(sorted(held_out), "preparing photos"):
         try:
-            if name not in model.names:
-                same = [other for other in model.names if Path(other).stem == Path(name).stem]
-                raise UserError(f"has no pose or no file; of other folder or extension: {same}")
+            check(name in model.photos, f"has no pose{nearest(name, model.files)}")
+            check(name in model.files, f"is not on disk{nearest(name, model.on_disk)}")
             camera, pose, ids = model.photos[name]
             check_photo(camera, pose, held_out[name])
             image, K = read_photo(model.files[name], camera, downscale)
-            own = [rows[key] for key in ids if key in rows]
-            usable[name] = image, K, camera_to_world(pose), np.array(own, int)
         except UserError as e:
             warn(f"left out: {name} {e}")
+            continue
+        c2w = camera_to_world(pose)
+        own = np.array([rows[key] for key in ids if key in rows], int)
+        uv, _ = project(K, c2w, points[own, :3])
+        is_inside = ((uv >= 0) & (uv < image.shape[1::-1])).all(1)
+        if len(own) and is_inside.mean() < 0.5:
+            misfits[name] = is_inside.mean()
+        usable[name] = image, K, c2w, own
+    check(
+        2 * len(misfits) <= len(usable),
+        f"{len(misfits)} of {len(usable)} photos miss most of their points: give poses as "
+        "COLMAP does, world to camera, x right, y down, z forward, in the units of the points")
+    for name, share in misfits.items():
+        warn(f"left out: {name} shows {share:.0%} of its points: its pose or its distortion "
+             "is wrong")
+        del usable[name]
     lost = [name for name in held_out if held_out[name] and name not in usable]
-    check(not lost, f"held-out photos cannot be used, mend them or hold out others: {lost}")
+    check(
+        not lost,
+        f"held-out photos cannot be used, mend them or hold out others: {lost}")
     count = sum(not held_out[name] for name in usable)
-    check(count >= 2, f"{count} usable training photos are too few: mend them or the split file")
+    check(
+        count >= 2,
+        f"{count} usable training photos are too few: mend them or the split file")
     return usable
 
 
@@ -1064,25 +1358,31 @@ def prepare(name, downscale=2, split=None):
             folder = DATA / SCENES[name][0]
     model = find_model(folder, command)
     split = os.path.abspath(split) if split else None
-    info = dict(scene=folder.resolve().name, kind="colmap", downscale=downscale,
-                folder=str(folder), images=str(model.images), split=split)
+    info = dict(
+        scene=folder.resolve().name,
+        kind="colmap",
+        downscale=downscale,
+        folder=str(folder),
+        images=str(model.images),
+        posed=sorted(model.photos),
+        split=split)
     info["files"] = fingerprint(info)
-    held_out = choose_parts(folder, model.names, split)
+    tables = split_files(folder, split)
+    held_out = choose_parts(folder, sorted(model.files), tables)
     points, rows = read_points(model.sparse)
-    usable = read_usable(model, rows, held_out, downscale)
+    usable = read_usable(model, points, rows, held_out, downscale)
+    masks = read_masks(model, usable)
     images, K, c2w, tracks = zip(*usable.values())
     is_test = [held_out[name] for name in usable]
-    scene = build_scene(images, K, c2w, is_test, list(usable), points, tracks, info)
-    uv = scene["track_uv"]
-    share = (abs(uv - .5) <= .5).all(1).mean()
-    says = f"only {share:.0%} of all sightings of points fall into the photo that saw them"
-    photo = scene["track_photo"]
-    spread = np.median([np.std(uv[photo == i], axis=0).max() for i in np.unique(photo)])
-    is_sound = share >= .5 and spread > .02  # points in smaller units lie close together
-    check(is_sound, f"{says}: give poses as COLMAP does, world to camera, x right, y down, "
-          "z forward, in the units of the points")
-    if share < .9:
-        warn(says)
+    scene = build_scene(
+        images, K, c2w, is_test, list(usable), points, tracks, info, masks=masks)
+    spread = [
+        np.std(scene["track_uv"][scene["track_photo"] == i], axis=0).max()
+        for i in np.unique(scene["track_photo"])
+    ]
+    check(
+        np.median(spread) > 0.02,
+        "the points of a photo lie on one spot of it: give poses in the units of the points")
     inside = (lengths(scene["points"]) < 1).mean()
     print(f"the sphere has a radius of {scene['scale']:.3g} units of the reconstruction; "
           f"{inside:.0%} of the points are inside")
@@ -1099,7 +1399,7 @@ def scene_path(name_or_folder):
 
 
 def open_scene(name_or_folder, downscale=2):
-    """Scene from its file: made on first use, and anew if its sources differ in any way."""
+    """Scene from its file: made on first use, and anew if the content of a source differs."""
     path = scene_path(name_or_folder)
     split = None
     if path.exists():
@@ -1109,28 +1409,35 @@ def open_scene(name_or_folder, downscale=2):
         if info["kind"] == "toy" or (info["downscale"] == downscale and is_fresh(info)):
             return scene
     print(f"making {path}")
-    scene = make_toy() if name_or_folder == "toy" else prepare(name_or_folder, downscale, split)
+    if name_or_folder == "toy":
+        scene = make_toy()
+    else:
+        scene = prepare(name_or_folder, downscale, split)
     write_scene(path, scene)
     return scene
 
 
 def is_fresh(info):
-    """Whether a scene's sources are as they were, or gone: a scene file does without them."""
-    return not Path(info["folder"]).is_dir() or info.get("files") == fingerprint(info)
+    """Whether a scene's sources are as they were, or gone: a scene file does without."""
+    if not Path(info["folder"]).is_dir():
+        return True
+    return "posed" in info and info["files"] == fingerprint(info)
 
 
-# ---- download, SfM, command line -----------------------------------------------------------------
+# ---- download, SfM, command line -------------------------------------------------------
 def fetch(folder_url, path):
-    """Streams the file of path's name into path, unless that exists; what came of a broken transfer
-    waits in path.part to be continued."""
+    """Streams the file of path's name into path, unless that exists.
+
+    The part that came of a broken transfer waits in path.part to be continued.
+    """
     if path.exists():
         return
     url = folder_url + path.name
     part = path.with_name(path.name + ".part")
     try:
         path.parent.mkdir(exist_ok=True)
-        with open(part, "ab") as file:  # the last byte again: so a whole part is no special case
-            have = max(file.tell() - 1, 0)
+        with open(part, "ab") as file:
+            have = max(file.tell() - 1, 0)  # the last byte again: also of a whole part
             request = Request(url, headers={"Range": f"bytes={have}-"})
             with urlopen(request, timeout=60) as answer:
                 if answer.status != 206:
@@ -1144,7 +1451,8 @@ def fetch(folder_url, path):
     except Exception as e:  # of the disk, the network or its protocol
         if getattr(e, "code", 0) == 416:  # longer than the file itself
             part.unlink()
-        raise UserError(f"the download of {url} broke ({e}); the same command continues it") from e
+        says = f"the download of {url} broke ({e}); the same command continues it"
+        raise UserError(says) from e
 
 
 def unpack(archive, wanted, folder):
@@ -1174,31 +1482,96 @@ def download(name):
             shutil.copy(table, place / table.name)
             place.replace(home)
     except Exception as e:  # a damaged archive can fail in any layer
-        raise UserError(f"cannot unpack {archive} ({e}): free space, or delete it and retry") from e
+        says = f"cannot unpack {archive} ({e}): free space, or delete it and retry"
+        raise UserError(says) from e
+
+
+def sfm_photos(images):
+    """{name: path} of raw photos, all of which pycolmap can read."""
+    files = photo_files(images)
+    for name in [name for name, path in files.items() if not path.is_file()]:
+        warn(f"left out: {name} is a broken link")
+        del files[name]
+    check(files, f"{images} has no photos: name the folder that holds them")
+    heic = [name for name, path in files.items() if is_heic(path.open("rb").read(12))]
+    check(
+        not heic,
+        f"{len(heic)} photos are HEIC, such as {heic[:1]}, which cannot be read: convert "
+        "them to JPEG")
+    for name in files:
+        is_text = os.fsencode(name).decode(errors="replace") == name
+        check(is_text, f"the name {name!a} is not UTF-8: rename the photo")
+    return files
+
+
+def write_sfm_masks(files, masks, folder):
+    """Masks in the photos' sizes under COLMAP's names, photo.jpg.png."""
+    for name, path in masks.items():
+        photo = decode(
+            files[name].read_bytes(), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+        check(photo is not None, f"{files[name]} is damaged: replace it")
+        try:
+            mask = read_mask(path, photo.shape[1::-1])
+        except UserError as e:
+            warn(f"mask not used: {path} {e}")
+            continue
+        target = folder / f"{name}.png"
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.write_bytes(cv2.imencode(".png", mask)[1].tobytes())
+
+
+def import_pycolmap():
+    install = 'run pip install "pycolmap>=3.13"'
+    try:
+        import pycolmap  # an extra
+    except ImportError as e:
+        raise UserError(f"--sfm needs pycolmap ({e}): {install}") from e
+    check(
+        hasattr(pycolmap, "FeatureExtractionOptions"),
+        f"pycolmap {pycolmap.__version__} is too old: {install}")
+    return pycolmap
 
 
 def run_sfm(folder):
-    """Poses for the raw photos in `folder`, by pycolmap -> folder/dense/{images,sparse}"""
-    import pycolmap  # an extra: main says when it is not there
-    database = folder / "database.db"
-    models = folder / "models"
-    dense = folder / "dense"
-    photos = next(folder.glob("images"), folder)  # beside it lie smaller copies and masks
-    check(folder.is_dir() and not dense.exists(),
-          f"{folder} is missing, or has dense/: delete that")
-    models.mkdir(exist_ok=True)
-   # Of 135 photos of a statue in all lights these options pose 104 in one model instead of 60.
+    """Poses for the raw photos in `folder`, by pycolmap -> folder/sparse/{0,1,...}
+
+    The database waits in data/ for a second try and goes after a success.
+    """
+    images = folder / "images"
+    if not images.is_dir():
+        images = folder
+    sparse = folder / "sparse"
+    check(
+        not sparse.exists() and not (folder / "dense").exists(),
+        f"{folder} has sparse/ or dense/, a model: leave --sfm out, or delete that")
+    files = sfm_photos(images)
+    masks = mask_files(images, files)
+    pycolmap = import_pycolmap()
+    work = DATA / f"sfm-{photos_checksum(files, masks):08x}"
+    work.mkdir(parents=True, exist_ok=True)
+    database = work / "database.db"
+    reader = pycolmap.ImageReaderOptions()
+    if masks:
+        write_sfm_masks(files, masks, work / "masks")
+        reader.mask_path = work / "masks"
+    # Of 135 photos of a statue in all lights these options pose 104 in one model, not 60.
     features = pycolmap.FeatureExtractionOptions()
     features.sift.estimate_affine_shape = True
     features.sift.domain_size_pooling = True
     matching = pycolmap.FeatureMatchingOptions()
     matching.guided_matching = True
-    pycolmap.extract_features(database, photos, extraction_options=features)
+    pycolmap.extract_features(
+        database, images, sorted(files), reader_options=reader, extraction_options=features)
     pycolmap.match_exhaustive(database, matching_options=matching)
-    found = pycolmap.incremental_mapping(database, photos, models)
-    check(found, f"the photos in {folder} do not match each other; take more, with more overlap")
-    best = max(found, key=lambda i: found[i].num_reg_images())
-    pycolmap.undistort_images(dense, models / str(best), photos)
+    with tempfile.TemporaryDirectory(prefix=".sparse", dir=folder) as temporary:
+        models = Path(temporary, "models")
+        models.mkdir()
+        found = pycolmap.incremental_mapping(database, images, models)
+        check(
+            found,
+            f"the photos in {folder} do not match each other; take more, with more overlap")
+        models.rename(sparse)
+    shutil.rmtree(work)
 
 
 def main(argv=None):
@@ -1210,13 +1583,15 @@ def main(argv=None):
     add("--download", action="store_true", help="fetch archive and split file first")
     add("--sfm", action="store_true", help="the folder has raw photos: pose them first")
     add("--downscale", type=int, help="photos get this many times smaller; default 2")
-    add("--split", help="default: a .tsv, .csv or train_list.txt in the folder, or every 8th photo")
+    add("--split", help="default: a .tsv, .csv or train_list.txt in it, or every 8th photo")
     knobs = inspect.signature(make_toy).parameters
     for key, knob in knobs.items():
         how = {"type": type(knob.default)}
         if isinstance(knob.default, bool):
             how = {"action": argparse.BooleanOptionalAction}
         add(f"--{key}", help=f"toy, default {knob.default}", **how)
+    allow_any_character()
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C
     given = vars(parser.parse_args(argv))
     name = given.pop("scene")
     is_download = given.pop("download", False)
@@ -1232,7 +1607,7 @@ def main(argv=None):
             run_sfm(Path(name))
         scene = make_toy(**given) if name == "toy" else prepare(name, **given)
         write_scene(path, scene)
-    except (UserError, OSError, MemoryError, ImportError, KeyboardInterrupt) as e:
+    except (UserError, OSError, MemoryError, KeyboardInterrupt) as e:
         warn(f"error: {str(e) or 'stopped; start again'}")
         sys.exit(2)
     print(f"{path}: {len(scene['wh'])} photos, {scene['is_test'].sum()} of them for testing")
