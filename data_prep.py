@@ -1210,8 +1210,11 @@ def fingerprint(info):
     return photos_checksum(files, masks, start)
 
 
-def is_heic(data):
-    return data[4:8] == b"ftyp" and data[8:12] in (b"heic", b"heix", b"mif1", b"msf1")
+def is_heic(path):
+    """Also under another extension, as phones and mail send it."""
+    with open(path, "rb") as file:
+        head = file.read(12)
+    return head[4:8] == b"ftyp" and head[8:] in (b"heic", b"heix", b"mif1", b"msf1")
 
 
 def decode(data, flags):
@@ -1239,8 +1242,8 @@ def read_photo(path, camera, downscale):
     w, h = camera[0]
     check(1 <= downscale <= min(w, h) / 2, f"is {w} x {h}: choose another --downscale")
     check(path.is_file(), "is a broken link: copy the photo itself")
+    check(not is_heic(path), "is HEIC, which cannot be read: convert it to JPEG")
     data = path.read_bytes()
-    check(not is_heic(data), "is HEIC, which cannot be read: convert it to JPEG")
     # OpenCV is silent where a file is cut off. A JPEG has an end mark after its last scan.
     is_cut_jpeg = (
         data[:2] == b"\xff\xd8" and data.rfind(b"\xff\xd9") < data.rfind(b"\xff\xda"))
@@ -1493,7 +1496,7 @@ def sfm_photos(images):
         warn(f"left out: {name} is a broken link")
         del files[name]
     check(files, f"{images} has no photos: name the folder that holds them")
-    heic = [name for name, path in files.items() if is_heic(path.open("rb").read(12))]
+    heic = [name for name, path in files.items() if is_heic(path)]
     check(
         not heic,
         f"{len(heic)} photos are HEIC, such as {heic[:1]}, which cannot be read: convert "
