@@ -628,10 +628,9 @@ def make_toy(seed=0, size=96, photos=48, test=8, occluders=0.05, exposure=1.0,
         locals(), scene="toy", kind="toy", downscale=1, folder=None, split=None)
     is_sound = occluders <= 0.6 and exposure <= 2 and sun <= 180 and pose_noise < np.inf
     is_sound &= min(seed, test, occluders, exposure, pose_noise, landmark, sun) >= 0
-    check(
-        is_sound and size >= 16 and photos >= 4,
-        "occluders in 0..0.6, exposure 0..2, sun 0..180, size >= 16, photos >= 4, "
-        "others >= 0")
+    check(is_sound and size >= 16 and photos >= 4,
+          "occluders in 0..0.6, exposure 0..2, sun 0..180, size >= 16, photos >= 4, "
+          "others >= 0")
     # No knob changes another's random numbers.
     generators = [np.random.default_rng([seed, k]) for k in range(6)]
     camera, taste, people, sfm, shake, day = generators
@@ -727,9 +726,8 @@ def find_sphere(x, weight, tracks, is_test, contain):
         for own, held_out in zip(tracks, is_test)
         if len(own) and not held_out
     ]
-    check(
-        reach,
-        "no training photo observes a usable 3D point: they do not belong together")
+    check(reach,
+          "no training photo observes a usable 3D point: they do not belong together")
     corners = lengths(np.reshape(contain, (-1, 3)) - centre)
     radius = max(radius, np.median(reach), *1.02 * corners)
     check(radius > 1 / FAR, "all 3D points coincide: run SfM again")
@@ -747,9 +745,8 @@ def build_scene(
     usable = views >= 3
     if usable.sum() < 500:
         usable = views >= 2
-    check(
-        usable.sum() >= 20,
-        f"{usable.sum()} usable 3D points: SfM needs more overlapping photos")
+    check(usable.sum() >= 20,
+          f"{usable.sum()} usable 3D points: SfM needs more overlapping photos")
     usable &= error <= np.quantile(error[usable], 0.95)
     new_index = np.cumsum(usable) - 1
     tracks = [new_index[own[usable[own]]] for own in tracks]
@@ -865,10 +862,9 @@ OPENCV_DISTORTION = "k1 k2 p1 p2 k3 k4 k5 k6".split()
 
 def open_binary(path):
     """A function that reads the next values of a little-endian file, by struct's layouts."""
-    check(
-        path.is_file(),
-        f"{path} is missing: copy the whole model, or for points run "
-        "colmap point_triangulator")
+    check(path.is_file(),
+          f"{path} is missing: copy the whole model, or for points run "
+          "colmap point_triangulator")
     file = io.BytesIO(path.read_bytes())
 
     def read(layout):
@@ -888,10 +884,9 @@ def read_cameras(sparse):
     (count,) = read("Q")
     for _ in range(count):
         number, kind, *wh = read("IiQQ")
-        check(
-            0 <= kind < len(CAMERA_MODELS),
-            f"{sparse} has camera model {kind}, which is unknown: run "
-            "colmap image_undistorter")
+        check(0 <= kind < len(CAMERA_MODELS),
+              f"{sparse} has camera model {kind}, which is unknown: run "
+              "colmap image_undistorter")
         kind, names = list(CAMERA_MODELS.items())[kind]
         names = names.split()
         value = dict(zip(names, read(f"{len(names)}d")))
@@ -916,29 +911,24 @@ def read_photos(sparse):
         name = name.replace("\\", "/")  # of Windows
         (sightings,) = read("Q")
         ids = read(f"{3 * sightings}Q")[2::3]  # of u, v, point
-        check(
-            name not in photos and not {"", ".."} & set(name.split("/")),
-            f"{sparse}: photo {name!r} occurs twice or lies outside the image folder: "
-            "rename it")
+        check(name not in photos and not {"", ".."} & set(name.split("/")),
+              f"{sparse}: photo {name!r} occurs twice or lies outside the image folder: "
+              "rename it")
         photos[name] = cameras.get(camera), np.array(pose), ids
     return photos
 
 
 def check_photo(camera, pose, is_test):
     """UserError, a sentence about the photo, unless it can be used."""
-    check(
-        camera,
-        "has no camera in the model, or a fisheye: run colmap image_undistorter")
+    check(camera,
+          "has no camera in the model, or a fisheye: run colmap image_undistorter")
     wh, K, distortion = camera
     numbers = np.concatenate([K, distortion, pose])
     is_sound = (abs(numbers) < FAR).all() and min(K[:2]) > 1 / FAR and pose[:4].any()
-    check(
-        is_sound and max(wh) < 32767,
-        "has no sound camera or pose: run SfM again")
+    check(is_sound and max(wh) < 32767, "has no sound camera or pose: run SfM again")
     angle = 2 * np.degrees(np.arctan(max(wh / K[:2]) / 2))
-    check(
-        is_test or 10 <= angle <= 120,
-        f"is {angle:.1f} degrees wide, which is not in 10..120")
+    check(is_test or 10 <= angle <= 120,
+          f"is {angle:.1f} degrees wide, which is not in 10..120")
 
 
 def camera_to_world(pose):
@@ -961,9 +951,8 @@ def read_points(sparse):
         points.append((x, y, z, error, views))
     points = np.array(points, float).reshape(-1, 5)
     points[~(abs(points) < FAR).all(1)] = 0  # nan as well: nobody sees them
-    check(
-        (points[:, 4] > 1).any(),
-        f"no point of {sparse} has a track: run colmap point_triangulator on it")
+    check((points[:, 4] > 1).any(),
+          f"no point of {sparse} has a track: run colmap point_triangulator on it")
     return points, rows
 
 
@@ -1066,26 +1055,22 @@ def find_model(folder, command):
     models = [open_model(folder, sparse) for sparse in model_folders(folder)]
     if not models and folder.name in ("images", "input"):
         parent = Path(os.path.abspath(folder)).parent
-        check(
-            not model_folders(parent),
-            f"{folder} has no COLMAP model, the folder around it has: give {parent}")
-    check(
-        models,
-        f"{folder} has no binary COLMAP model: run python data_prep.py {command}, or for a "
-        "text model colmap model_converter --output_type BIN")
+        check(not model_folders(parent),
+              f"{folder} has no COLMAP model, the folder around it has: give {parent}")
+    check(models,
+          f"{folder} has no binary COLMAP model: run python data_prep.py {command}, or for a "
+          "text model colmap model_converter --output_type BIN")
     best = max(models, key=lambda model: model.count)
-    check(
-        best.photos,
-        f"{best.sparse} is an empty model, no photo is posed: delete it and run "
-        f"python data_prep.py {command}")
+    check(best.photos,
+          f"{best.sparse} is an empty model, no photo is posed: delete it and run "
+          f"python data_prep.py {command}")
     lost = sorted(best.photos.keys() - best.files)
     if lost:
         hint = nearest(lost[0], best.on_disk)
         says = f"{len(lost)} photos of {best.sparse} are not on disk, such as {lost[0]!r}{hint}"
-        check(
-            best.files,
-            f"{says}: put them into {folder / 'images'}, or run "
-            f"python data_prep.py {command}")
+        check(best.files,
+              f"{says}: put them into {folder / 'images'}, or run "
+              f"python data_prep.py {command}")
         warn(says)
     print(f"{best.images}: {max(len(model.on_disk) for model in models)} photos on disk, "
           f"{len(best.files)} posed by {best.sparse}")
@@ -1114,9 +1099,8 @@ def split_files(folder, split):
         tables = list(folder.glob("train*.txt"))
     if split:
         tables = [Path(split)]
-    check(
-        len(tables) < 2,
-        f"choose a split file by --split: {', '.join(map(str, tables))}")
+    check(len(tables) < 2,
+          f"choose a split file by --split: {', '.join(map(str, tables))}")
     if tables and tables[0].suffix == ".txt":
         name = tables[0].name
         tables = [
@@ -1141,9 +1125,8 @@ def read_split(tables):
         ]
     else:
         head, *rows = read_table(path)
-    check(
-        {"filename", "split"} <= set(head),
-        f"{path} needs a header with filename and split")
+    check({"filename", "split"} <= set(head),
+          f"{path} needs a header with filename and split")
     held_out = {}
     for words in rows:
         row = dict(zip(head, words))
@@ -1152,9 +1135,8 @@ def read_split(tables):
         name = row.get("filename")
         part = row.get("split")
         is_test = part == "test"
-        check(
-            name and part in ("train", "test") and held_out.get(name, is_test) == is_test,
-            f"{path}: {name!r} is {part!r}; each is train or test, and not both")
+        check(name and part in ("train", "test") and held_out.get(name, is_test) == is_test,
+              f"{path}: {name!r} is {part!r}; each is train or test, and not both")
         held_out[name] = is_test
     return held_out
 
@@ -1250,18 +1232,16 @@ def read_photo(path, camera, downscale):
     is_cut_png = data[1:4] == b"PNG" and b"IEND" not in data
     check(not is_cut_jpeg and not is_cut_png, "is cut off: copy it again")
     image = decode(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-    check(
-        image is not None,
-        "is empty, damaged, too large or no photo of a known type: replace it")
+    check(image is not None,
+          "is empty, damaged, too large or no photo of a known type: replace it")
     stored = image.shape[1::-1]
     if stored != (w, h):
         image = decode(data, cv2.IMREAD_COLOR)
     size = image.shape[1::-1]
     tag = "" if size == stored else f", {size[0]} x {size[1]} by its EXIF orientation tag"
-    check(
-        size == (w, h),
-        f"has {stored[0]} x {stored[1]} pixels{tag}, its camera {w} x {h}: put back what "
-        "SfM saw")
+    check(size == (w, h),
+          f"has {stored[0]} x {stored[1]} pixels{tag}, its camera {w} x {h}: put back what "
+          "SfM saw")
     image, K = undistort(image, camera)
     small = w // downscale, h // downscale
     image = cv2.resize(image, small, interpolation=cv2.INTER_AREA)
@@ -1274,9 +1254,8 @@ def read_mask(path, size):
     check(mask is not None, "is no image")
     mask = np.where(mask < 128, 0, 255).astype(np.uint8)
     h, w = mask.shape
-    check(
-        abs(w * size[1] / (h * size[0]) - 1) < 0.02,
-        f"has {w} x {h} pixels, its photo {size[0]} x {size[1]}")
+    check(abs(w * size[1] / (h * size[0]) - 1) < 0.02,
+          f"has {w} x {h} pixels, its photo {size[0]} x {size[1]}")
     check(mask.any(), "is black all over; 255 is white")
     return cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST)
 
@@ -1331,22 +1310,19 @@ def read_usable(model, points, rows, held_out, downscale):
         if len(own) and is_inside.mean() < 0.5:
             misfits[name] = is_inside.mean()
         usable[name] = image, K, c2w, own
-    check(
-        2 * len(misfits) <= len(usable),
-        f"{len(misfits)} of {len(usable)} photos miss most of their points: give poses as "
-        "COLMAP does, world to camera, x right, y down, z forward, in the units of the points")
+    check(2 * len(misfits) <= len(usable),
+          f"{len(misfits)} of {len(usable)} photos miss most of their points: give poses as "
+          "COLMAP does, world to camera, x right, y down, z forward, in the units of the points")
     for name, share in misfits.items():
         warn(f"left out: {name} shows {share:.0%} of its points: its pose or its distortion "
              "is wrong")
         del usable[name]
     lost = [name for name in held_out if held_out[name] and name not in usable]
-    check(
-        not lost,
-        f"held-out photos cannot be used, mend them or hold out others: {lost}")
+    check(not lost,
+          f"held-out photos cannot be used, mend them or hold out others: {lost}")
     count = sum(not held_out[name] for name in usable)
-    check(
-        count >= 2,
-        f"{count} usable training photos are too few: mend them or the split file")
+    check(count >= 2,
+          f"{count} usable training photos are too few: mend them or the split file")
     return usable
 
 
@@ -1383,9 +1359,8 @@ def prepare(name, downscale=2, split=None):
         np.std(scene["track_uv"][scene["track_photo"] == i], axis=0).max()
         for i in np.unique(scene["track_photo"])
     ]
-    check(
-        np.median(spread) > 0.02,
-        "the points of a photo lie on one spot of it: give poses in the units of the points")
+    check(np.median(spread) > 0.02,
+          "the points of a photo lie on one spot of it: give poses in the units of the points")
     inside = (lengths(scene["points"]) < 1).mean()
     print(f"the sphere has a radius of {scene['scale']:.3g} units of the reconstruction; "
           f"{inside:.0%} of the points are inside")
@@ -1497,10 +1472,9 @@ def sfm_photos(images):
         del files[name]
     check(files, f"{images} has no photos: name the folder that holds them")
     heic = [name for name, path in files.items() if is_heic(path)]
-    check(
-        not heic,
-        f"{len(heic)} photos are HEIC, such as {heic[:1]}, which cannot be read: convert "
-        "them to JPEG")
+    check(not heic,
+          f"{len(heic)} photos are HEIC, such as {heic[:1]}, which cannot be read: convert "
+          "them to JPEG")
     for name in files:
         is_text = os.fsencode(name).decode(errors="replace") == name
         check(is_text, f"the name {name!a} is not UTF-8: rename the photo")
@@ -1529,9 +1503,8 @@ def import_pycolmap():
         import pycolmap  # an extra
     except ImportError as e:
         raise UserError(f"--sfm needs pycolmap ({e}): {install}") from e
-    check(
-        hasattr(pycolmap, "FeatureExtractionOptions"),
-        f"pycolmap {pycolmap.__version__} is too old: {install}")
+    check(hasattr(pycolmap, "FeatureExtractionOptions"),
+          f"pycolmap {pycolmap.__version__} is too old: {install}")
     return pycolmap
 
 
@@ -1544,9 +1517,8 @@ def run_sfm(folder):
     if not images.is_dir():
         images = folder
     sparse = folder / "sparse"
-    check(
-        not sparse.exists() and not (folder / "dense").exists(),
-        f"{folder} has sparse/ or dense/, a model: leave --sfm out, or delete that")
+    check(not sparse.exists() and not (folder / "dense").exists(),
+          f"{folder} has sparse/ or dense/, a model: leave --sfm out, or delete that")
     files = sfm_photos(images)
     masks = mask_files(images, files)
     pycolmap = import_pycolmap()
@@ -1570,9 +1542,8 @@ def run_sfm(folder):
         models = Path(temporary, "models")
         models.mkdir()
         found = pycolmap.incremental_mapping(database, images, models)
-        check(
-            found,
-            f"the photos in {folder} do not match each other; take more, with more overlap")
+        check(found,
+              f"the photos in {folder} do not match each other; take more, with more overlap")
         models.rename(sparse)
     shutil.rmtree(work)
 
