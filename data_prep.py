@@ -1,14 +1,21 @@
 """Scene files for geonvs.py: a synthetic landmark, or photos with a COLMAP reconstruction.
 
-    python data_prep.py toy --occluders 0.4     -> data/toy.npz; every knob of make_toy is a flag
-    python data_prep.py brandenburg --download  -> data/brandenburg.npz, from an archive of 5 GB
-    python data_prep.py my_photos --sfm         raw photos, by pycolmap -> data/my_photos-*.npz
+    python data_prep.py toy --occluders 0.4     a toy -> data/toy.npz
+    python data_prep.py brandenburg --download  Phototourism, 5 GB -> data/brandenburg.npz
+    python data_prep.py my_photos --sfm         photos, posed first -> data/my_photos-*.npz
     python data_prep.py my_scene                photos and a COLMAP model in it -> the same
 
-The landmark lies in the unit sphere. A ray is c2w[:, 3] + t * d with |d| = 1; a distance is this t,
-never a z-depth. Functions raise UserError, one sentence that says what to do.
+Scene files. A scene is one .npz of the arrays in FORMAT, below; some have those in OPTIONAL.
+The landmark lies in the unit sphere. A ray is c2w[:, 3] + t * d with |d| = 1; a distance
+is this t, never a z-depth. x right, y down, z forward are a camera's axes, as in OpenCV.
+
+Masks. In masks/ beside images/, the mask of photo.jpg is photo.png, photo.jpg.png or
+photo.jpg; its black pixels are left out.
+
+Functions raise UserError, one sentence that says what to do.
 """
 import argparse
+import difflib
 import gzip
 import inspect
 import io
@@ -17,24 +24,24 @@ import json
 import os
 import re
 import shutil
+import signal
 import struct
 import sys
 import tarfile
 import tempfile
 import time
+import unicodedata
 import zipfile
 import zlib
-from pathlib import Path
+from collections import defaultdict
+from pathlib import Path, PurePosixPath
 from types import SimpleNamespace
+from typing import NamedTuple
 from urllib.request import Request, urlopen
 
 import cv2
 import numpy as np
-from numpy import arange, arctan2, array, bincount, clip, column_stack, concatenate, cross, cumsum
-from numpy import eye, flatnonzero, float32, floor, hypot, inf, maximum, median, minimum, quantile
-from numpy import radians, repeat, reshape, sin, sqrt, stack, std, uint8, where, zeros
 from numpy.linalg import norm
-from numpy.random import default_rng
 
 # name: (archive, split file)
 SCENES = {
@@ -46,30 +53,38 @@ SCENES = {
 DATA = Path("data")
 ARCHIVE_URL = "https://www.cs.ubc.ca/research/kmyi_data/imw2020/TrainingData/"
 SPLIT_URL = "https://nerf-w.github.io/data/selected_images/"
-# A scene is one .npz of these arrays: I photos, J = I + 1, N pixels, K points, T observations. A
-# toy has more: depth float16 (N,), true distance, inf is sky; occluder bool (N,), by people; and
-# what toy_walls returns.
+# The arrays of a scene file: data type and shape. Scene units, unless said.
 FORMAT = dict(
-    rgb="uint8 N3",
-    start="int64 J",   # photo i is rgb[start[i]:start[i + 1]], row by row
-    wh="int32 I2",   # width, height
-    K="float64 I4",   # fx fy cx cy [px]; the first pixel's centre is at 0.5 0.5
-    c2w="float64 I34",   # camera to world; OpenCV: x right, y down, z forward
-    is_test="bool I",   # held out from training
-    name="<U I",
-    points="float32 K3",
-    center="float64 3",   # SfM units: x * scale + center
-    scale="float64",
-    track_photo="int32 T",   # sorted; this photo sees
-    track_point="int32 T",   # this point
-    track_uv="float32 T2",   # there, over wh: in 0..1 if inside
-    near="float32 I",
-    footprint="float64",
-    exposure_spread="float64",
-    bg_color="float64 3",
-    info="<U",   # JSON: scene, kind (toy or colmap), downscale, folder, split; of a toy its knobs
+    rgb=("uint8", ["pixels", 3]),  # photo i is rgb[start[i]:start[i + 1]], row by row
+    start=("int64", ["photos + 1"]),
+    wh=("int32", ["photos", 2]),  # width, height
+    K=("float64", ["photos", 4]),  # fx fy cx cy [px]; the first pixel's centre is 0.5 0.5
+    c2w=("float64", ["photos", 3, 4]),  # camera to world: x_world = c2w @ (x_camera, 1)
+    is_test=("bool", ["photos"]),  # held out from training
+    name=("<U", ["photos"]),
+    near=("float32", ["photos"]),  # distance at which the photo's content begins
+    points=("float32", ["points", 3]),  # of SfM
+    track_photo=("int32", ["sightings"]),  # sorted; this photo sees
+    track_point=("int32", ["sightings"]),  # this point
+    track_uv=("float32", ["sightings", 2]),  # there, over wh: in 0..1 if inside
+    center=("float64", [3]),  # SfM units are x * scale + center
+    scale=("float64", []),
+    footprint=("float64", []),  # a typical pixel's size on the landmark
+    exposure_spread=("float64", []),  # between training photos, of brightness in 0..1
+    bg_color=("float64", [3]),  # in 0..1, where it is one colour; else NaN
+    info=("<U", []),  # JSON: scene, kind (toy or colmap), downscale, folder, split, ...
 )
-FAR = 1e9   # sound reconstructions have no larger number; float32 holds its square
+OPTIONAL = dict(
+    masked=("bool", ["pixels"]),  # black in a mask of the photographer's: left out
+    # Of toys: the truth.
+    depth=("float16", ["pixels"]),  # distance; inf is sky
+    occluder=("bool", ["pixels"]),  # a person
+    wall=("float64", ["walls", 3]),  # visible points where the surface is smooth
+    wall_normal=("float64", ["walls", 3]),
+    near_wall=("float64", ["near walls", 3]),  # points near surfaces
+    near_wall_sdf=("float64", ["near walls"]),  # signed distance there, + outside
+)
+FAR = 1e9  # sound reconstructions have no larger number; float32 holds its square
 
 
 class UserError(Exception):
@@ -85,10 +100,17 @@ def warn(message):
     print(message, file=sys.stderr)
 
 
+def allow_any_character():
+    """From now on a character that the terminal lacks is printed as its code."""
+    for stream in (sys.stdout, sys.stderr):
+        if hasattr(stream, "reconfigure"):  # a notebook's has not, and knows all
+            stream.reconfigure(errors="backslashreplace")
+
+
 def progress(items, what):
-    """Yields items; says how far it is once that took ten seconds, or a minute in a log file."""
+    """Yields items; tells how far it is after ten seconds, or a minute in a log file."""
     is_terminal = sys.stdout.isatty()
-    wait = 1 if is_terminal else 60   # seconds
+    wait = 1 if is_terminal else 60  # seconds
     due = max(10, wait)
     begin = time.monotonic()
     total = len(items)
@@ -98,28 +120,31 @@ def progress(items, what):
         is_last = done == total
         if past > due or (is_last and past > 10):
             due = past + wait
-            line = f"  {what}: {done} of {total}, {past / done * (total - done):.0f} s left "
+            left = past / done * (total - done)
+            line = f"  {what}: {done} of {total}, {left:.0f} s left "
             if is_terminal:
-                line = "\r" + line   # over the one before
-            print(line, end="" if is_terminal and not is_last else "\n", flush=True)
+                line = "\r" + line  # over the one before
+            end = "" if is_terminal and not is_last else "\n"
+            print(line, end=end, flush=True)
 
 
 def atomic_write(path, write):
-    """write(temporary path), then rename: `path` is the whole old file or the whole new one."""
+    """write(temporary path), then rename: `path` is the whole old file or the new one."""
     part = path.with_name(f".{path.stem}.{os.getpid()}.{time.time_ns()}{path.suffix}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         result = write(part)
-        check(result is not False, f"cannot encode {path}")   # so cv2.imwrite says no
+        check(result is not False, f"cannot encode {path}")  # so cv2.imwrite says no
         part.replace(path)
     except OSError as e:
-        raise UserError(f"cannot write {path} ({e.strerror or e}): free or choose a place") from e
+        says = f"cannot write {path} ({e.strerror or e}): free or choose a place"
+        raise UserError(says) from e
     finally:
         part.unlink(missing_ok=True)
 
 
 def write_scene(path, scene):
-    """Uncompressed: a third larger, but six times faster to write and no slower to read."""
+    """Not compressed: a third larger, but six times faster to write."""
     atomic_write(path, lambda part: np.savez(part, **scene))
 
 
@@ -127,49 +152,49 @@ def refuse_bomb(path):
     """UserError for a zip file that is larger inside than outside: ours never are."""
     with zipfile.ZipFile(path) as file:
         inside = sum(member.file_size for member in file.infolist())
-        check(inside <= os.path.getsize(path), f"{path} is larger inside than outside")
+    check(inside <= os.path.getsize(path), f"{path} is larger inside than outside")
 
 
 def check_scene(scene):
     """UserError unless the arrays fit FORMAT and each other."""
-    start = scene["start"]
-    wh = scene["wh"]
-    photos = len(wh)
-    points = len(scene["points"])
-    tracks = scene["track_photo"], scene["track_point"]
-    sizes = {"2": 2, "3": 3, "4": 4, "I": photos, "J": photos + 1, "K": points, "N": start[-1],
-             "T": len(tracks[0])}
-    for key, text in FORMAT.items():
+    sizes = {
+        "photos": len(scene["wh"]),
+        "photos + 1": len(scene["wh"]) + 1,
+        "pixels": len(scene["rgb"]),
+        "points": len(scene["points"]),
+        "sightings": len(scene["track_photo"]),
+        "walls": len(scene.get("wall", ())),
+        "near walls": len(scene.get("near_wall", ())),
+    }
+    optional = {key: OPTIONAL[key] for key in OPTIONAL.keys() & scene}
+    for key, (dtype, shape) in (FORMAT | optional).items():
         value = scene[key]
-        dtype, _, letters = text.partition(" ")
-        shape = tuple(sizes[letter] for letter in letters)
+        shape = tuple(sizes.get(size, size) for size in shape)
         check(value.shape == shape and str(value.dtype).startswith(dtype), key)
-        if dtype.startswith("float") and key != "bg_color":
+        if dtype.startswith("float") and key not in ("bg_color", "depth"):
             check(np.isfinite(value).all(), key)
-    np.ravel_multi_index(tracks, (photos, points))   # ValueError if any is out of range
-    check(wh.min() > 0 and np.array_equal(start, cumsum([0, *wh.prod(1)])), "start")
-    check(min(scene["footprint"], scene["scale"]) > 0 and not scene["is_test"].all(), "scale")
+    for key, count in [("track_photo", sizes["photos"]), ("track_point", sizes["points"])]:
+        check((scene[key] >= 0).all() and (scene[key] < count).all(), key)
+    start = np.cumsum([0, *scene["wh"].prod(1)])
+    check(scene["wh"].min() > 0 and np.array_equal(scene["start"], start), "start")
+    check(start[-1] == sizes["pixels"], "rgb")
+    check(scene["footprint"] > 0 and scene["scale"] > 0, "scale")
+    check(not scene["is_test"].all(), "is_test")
     info = json.loads(str(scene["info"]))
     check({"kind", "scene", "downscale", "folder", "split"} <= set(info), "info")
 
 
 def read_scene(path):
-    """The dictionary of a scene file; UserError unless it is whole, and fits FORMAT and itself."""
+    """The dictionary of a scene file; UserError unless it is whole and fits FORMAT."""
     try:
         refuse_bomb(path)
         with np.load(path, allow_pickle=False) as file:
             scene = dict(file)
         check_scene(scene)
-    except Exception as e:   # a damaged file can fail in any layer: zip, array header, dtype, text
-        raise UserError(f"{path} is no whole scene, or too large: delete it, it is remade") from e
+    except Exception as e:  # a damaged file can fail in any layer: zip, header, dtype, text
+        says = f"{path} is no whole scene, or too large: delete it, it is remade"
+        raise UserError(says) from e
     return scene
-
-
-# ---- the toy: z up, front towards -y, in its own units; world = TOY_SCALE * x + TOY_ORIGIN -------
-TOY_SCALE = 3.7
-TOY_ORIGIN = 12.0, -7.0, 5.0
-SUN = array([-.50, -.62, .60])   # left, behind the tourists
-SUN /= norm(SUN)
 
 
 def lengths(x):
@@ -177,253 +202,303 @@ def lengths(x):
     return norm(x, axis=1)
 
 
-def table(text):
-    """The numbers of a text, a row a line."""
-    return np.loadtxt(io.StringIO(text))
+# ---- the toy: z up, front towards -y, in its own units ---------------------------------
+TOY_SCALE = 3.7  # world = TOY_SCALE * x + TOY_ORIGIN
+TOY_ORIGIN = np.array([12.0, -7.0, 5.0])
+SUN = np.array([-0.50, -0.62, 0.60])  # left, behind the tourists
+SUN /= norm(SUN)
 
 
-# Colour, width and height of a cell, contrast of cells, has windows.
-MATERIALS = table("""
-     .5  .46   .4  .29  .13   .2  0   # 0 stone
-     .8  .74   .6  .29  .13  .08  0   # 1 pale
-    .78  .56   .3   .3   .3  .15  1   # 2 sand
-    .52  .19  .11   .3   .3  .15  1   # 3 brick
-     .6  .22  .12  .16  .08   .3  0   # 4 roof
-    .12  .19  .31   .2   .1  .25  0   # 5 slate
-    .16  .46  .36   .5   .5   .4  0   # 6 copper
-     .9  .58  .08   .5   .5    0  0   # 7 gold
-     .6  .46  .34  .62  .62  .15  1   # 8 house
-     .1  .22  .05   .2   .2  .45  0   # 9 leaf
-    .48  .42  .34  .42  .42   .2  0   # 10 paving
-    .17  .22  .08   .6   .6   .1  0   # 11 meadow
-""")
-SAND, ROOF, GOLD, MEADOW = 2, 4, 7, 11
-# Shape; centre x y z, half height, radius at the bottom and at the top, depth; material.
-# Shape 1 is a box or roof, |x| <= radius and |y| <= depth; 2 a column or cone; 3 a ball; 0 the
-# ground, z < 0. Plinth, columns, hall; dome; tower; annex; statue.
-LANDMARK = table("""
-    1  -.01  -.03   .05   .05   .96   .96   .53  0
-    1  -.05     0   .15   .05   .85   .85   .47  0
-    2     0  -.34   .47   .27  .062   .05  .062  1
-    2     0  -.34   .47   .27  .062   .05  .062  1
-    2     0  -.34   .47   .27  .062   .05  .062  1
-    2     0  -.34   .47   .27  .062   .05  .062  1
-    2     0  -.34   .47   .27  .062   .05  .062  1
-    2     0  -.34   .47   .27  .062   .05  .062  1
-    1   .03    .2   .53   .33   .59   .59   .26  2
-    1   .03   .03    .8   .06   .67   .67   .46  1
-    1   .03   .03   .98   .12   .71     0   .48  4
-    2  -.05   .22  1.07   .17   .33   .31   .33  2
-    3  -.05   .22  1.24    .3    .3    .3    .3  6
-    2  -.05   .22  1.57   .07  .075  .065  .075  1
-    2  -.05   .22   1.7   .06    .1   .02    .1  6
-    3  -.05   .22  1.78  .045  .045  .045  .045  7
-    1   .87   .18   .53   .53   .17   .17   .17  3
-    1   .87   .18   1.1   .04    .2    .2    .2  1
-    2   .87   .18  1.32   .18    .2     0    .2  5
-    1  -.76   .24   .38   .18   .19   .19   .25  3
-    1  -.76   .24   .65   .09   .23     0   .28  5
-    1   -.8  -.35   .28   .08   .09   .09   .09  1
-    2   -.8  -.35   .48   .12   .07   .04   .07  6
-    3   -.8  -.35   .64  .055  .055  .055  .055  6
-""")
-LANDMARK[2:8, 1] = np.linspace(-.54, .60, 6)   # the columns stand in a row
-# Groups of rows that are stretched and moved together: the first, and the one after the last.
-GROUPS = table("""
-     2  16   # what stands on the plinth
-    11  16   # of it the dome
-    16  19   # the tower
-    19  21   # the annex
-    21  24   # the statue
-""").astype(int)
-# The background: the ground, houses, each with a roof, and trees.
-TOWN = table("""
-    0     0    0     0     1   1   1   1  10
-    1  -7.5    2   .75   .75  .6  .6  .6   8
-    1  -7.5    2  1.75   .25  .6   0  .6   5
-    1  -6.2  4.4   .55   .55  .5  .5  .5   8
-    1  -6.2  4.4  1.35   .25  .5   0  .5   5
-    1    -4  6.4    .9    .9  .8  .8  .8   8
-    1    -4  6.4  2.05   .25  .8   0  .8   5
-    1  -1.2  7.6  1.15  1.15  .5  .5  .5   8
-    1  -1.2  7.6  2.55   .25  .5   0  .5   5
-    1     2  6.8    .7    .7  .7  .7  .7   8
-    1     2  6.8  1.65   .25  .7   0  .7   5
-    1   4.6  5.6   .95   .95  .5  .5  .5   8
-    1   4.6  5.6  2.15   .25  .5   0  .5   5
-    1   6.8    3   .65   .65  .6  .6  .6   8
-    1   6.8    3  1.55   .25  .6   0  .6   5
-    1   7.4    0   .85   .85  .5  .5  .5   8
-    1   7.4    0  1.95   .25  .5   0  .5   5
-    3  -7.5    2    .6    .6  .6  .6  .6   9
-    3  -6.2  4.4    .5    .5  .5  .5  .5   9
-    3    -4  6.4    .8    .8  .8  .8  .8   9
-    3  -1.2  7.6    .5    .5  .5  .5  .5   9
-    3     2  6.8    .7    .7  .7  .7  .7   9
-    3   4.6  5.6    .5    .5  .5  .5  .5   9
-    3   6.8    3    .6    .6  .6  .6  .6   9
-    3   7.4    0    .5    .5  .5  .5  .5   9
-""")
-TREES = TOWN[17:]   # yet with place and half width of the house that one stands before
-TREES[:, 3:8] *= .8
-TREES[:, 1:4] *= .8, .7, 1
-TREES[:, 1:4] += 1, 0, .2
+class Material(NamedTuple):
+    colour: tuple
+    cell: tuple  # width and height of a stone, or of the wall around a window
+    contrast: float  # between cells
+    has_windows: bool = False
+
+
+MATERIALS = dict(
+    stone=Material((0.5, 0.46, 0.4), (0.29, 0.13), 0.2),
+    pale=Material((0.8, 0.74, 0.6), (0.29, 0.13), 0.08),
+    sand=Material((0.78, 0.56, 0.3), (0.3, 0.3), 0.15, has_windows=True),
+    brick=Material((0.52, 0.19, 0.11), (0.3, 0.3), 0.15, has_windows=True),
+    tiles=Material((0.6, 0.22, 0.12), (0.16, 0.08), 0.3),
+    slate=Material((0.12, 0.19, 0.31), (0.2, 0.1), 0.25),
+    copper=Material((0.16, 0.46, 0.36), (0.5, 0.5), 0.4),
+    gold=Material((0.9, 0.58, 0.08), (0.5, 0.5), 0),
+    plaster=Material((0.6, 0.46, 0.34), (0.62, 0.62), 0.15, has_windows=True),
+    leaf=Material((0.1, 0.22, 0.05), (0.2, 0.2), 0.45),
+    paving=Material((0.48, 0.42, 0.34), (0.42, 0.42), 0.2),
+    meadow=Material((0.17, 0.22, 0.08), (0.6, 0.6), 0.1),
+)
+ALIKE = [("stone", "pale"), ("sand", "brick"), ("tiles", "slate", "copper")]
+
+
+class Part(NamedTuple):
+    shape: str  # "ground", "ball", "column" (or cone), "box" (or roof)
+    centre: tuple
+    half: tuple  # half width, depth and height; a ball's or column's radius
+    material: str
+    top: float = None  # half width at the top; None is the same as at the bottom
+
+    @property
+    def widths(self):
+        """Half width at the bottom and at the top."""
+        bottom = self.half[0]
+        return bottom, bottom if self.top is None else self.top
+
+
+PLINTH = [
+    Part("box", centre=(-.01, -.03, .05), half=(.96, .53, .05), material="stone"),
+    Part("box", centre=(-.05, 0, .15), half=(.85, .47, .05), material="stone"),
+]
+HALL = [
+    Part("column", centre=(x, -.34, .47), half=(.062, .062, .27), top=.05, material="pale")
+    for x in np.linspace(-.54, .60, 6)
+]
+HALL += [
+    Part("box", centre=(.03, .2, .53), half=(.59, .26, .33), material="sand"),
+    Part("box", centre=(.03, .03, .8), half=(.67, .46, .06), material="pale"),
+    Part("box", centre=(.03, .03, .98), half=(.71, .48, .12), top=0, material="tiles"),
+]
+DOME = [
+    Part("column", centre=(-.05, .22, 1.07), half=(.33, .33, .17), top=.31, material="sand"),
+    Part("ball", centre=(-.05, .22, 1.24), half=(.3, .3, .3), material="copper"),
+    Part("column", centre=(-.05, .22, 1.57), half=(.075, .075, .07), top=.065, material="pale"),
+    Part("column", centre=(-.05, .22, 1.7), half=(.1, .1, .06), top=.02, material="copper"),
+    Part("ball", centre=(-.05, .22, 1.78), half=(.045, .045, .045), material="gold"),
+]
+TOWER = [
+    Part("box", centre=(.87, .18, .53), half=(.17, .17, .53), material="brick"),
+    Part("box", centre=(.87, .18, 1.1), half=(.2, .2, .04), material="pale"),
+    Part("column", centre=(.87, .18, 1.32), half=(.2, .2, .18), top=0, material="slate"),
+]
+ANNEX = [
+    Part("box", centre=(-.76, .24, .38), half=(.19, .25, .18), material="brick"),
+    Part("box", centre=(-.76, .24, .65), half=(.23, .28, .09), top=0, material="slate"),
+]
+STATUE = [
+    Part("box", centre=(-.8, -.35, .28), half=(.09, .09, .08), material="pale"),
+    Part("column", centre=(-.8, -.35, .48), half=(.07, .07, .12), top=.04, material="copper"),
+    Part("ball", centre=(-.8, -.35, .64), half=(.055, .055, .055), material="copper"),
+]
+# Houses around: x, y, half width, half height; a tree stands before each.
+HOUSES = [
+    (-7.5, 2, .6, .75), (-6.2, 4.4, .5, .55), (-4, 6.4, .8, .9), (-1.2, 7.6, .5, 1.15),
+    (2, 6.8, .7, .7), (4.6, 5.6, .5, .95), (6.8, 3, .6, .65), (7.4, 0, .5, .85),
+]
+TOWN = [Part("ground", centre=(0, 0, 0), half=(1, 1, 1), material="paving")]
+for x, y, wide, tall in HOUSES:
+    crown = 0.8 * wide
+    TOWN += [
+        Part("box", centre=(x, y, tall), half=(wide, wide, tall), material="plaster"),
+        Part("box", centre=(x, y, 2 * tall + .25), half=(wide, wide, .25), top=0, material="slate"),
+        Part("ball", centre=(.8 * x + 1, .7 * y, crown + .2), half=[crown] * 3, material="leaf"),
+    ]
+
+
+def stretch(rng, parts):
+    """The parts, which stand on each other, in other proportions and moved a little."""
+    size = rng.uniform(0.7, 1.2, 3)
+    shift = np.append(rng.uniform(-0.06, 0.06, 2), 0)
+    centres = np.array([part.centre for part in parts])
+    foot = centres.mean(0)
+    foot[2] = centres[0, 2] - parts[0].half[2]
+    changed = []
+    for part, centre in zip(parts, centres):
+        grow = size if part.shape == "box" else size[[2, 2, 2]]  # others stay round
+        changed.append(part._replace(
+            centre=foot + (centre - foot) * size + shift,
+            half=part.half * grow,
+            top=part.widths[1] * grow[0]))
+    return changed
+
+
+def toy_landmark(number):
+    """The parts of the landmark; for other numbers than 0 it is another building."""
+    if number == 0:
+        return PLINTH + HALL + DOME + TOWER + ANNEX + STATUE
+    rng = np.random.default_rng([number, 1])
+    hall = stretch(rng, HALL + DOME)
+    hall[len(HALL):] = stretch(rng, hall[len(HALL):])
+    parts = PLINTH + hall
+    for group in (TOWER, ANNEX, STATUE):
+        parts += stretch(rng, group)
+    side = rng.choice((-1, 1))
+    other = {"gold": "gold"}
+    for names in ALIKE:
+        other |= dict(zip(names, rng.permutation(names)))
+    return [
+        part._replace(centre=part.centre * np.array([side, 1, 1]),
+                      material=other[part.material])
+        for part in parts
+    ]
 
 
 def toy_parts(landmark, background):
-    """(P,9): LANDMARK, for other numbers than 0 another building of such parts; maybe a town."""
-    parts = LANDMARK.copy()
-    if landmark:
-        rng = default_rng([landmark, 1])
-        for first, last in GROUPS:   # stretch and move
-            group = parts[first:last]
-            place = group[:, 1:4]
-            size = rng.uniform(.7, 1.2, 3)
-            shift = *rng.uniform(-.06, .06, 2), 0
-            foot = *place[:, :2].mean(0), place[0, 2] - group[0, 4]
-            place[:] = foot + (place - foot) * size + shift
-            is_box = group[:, :1] == 1   # others stay round
-            group[:, 4:8] *= where(is_box, size[[2, 0, 0, 1]], size[2])
-        parts[:, 1] *= rng.choice((-1, 1))
-        stones = rng.permutation(2)
-        walls = SAND + rng.permutation(2)
-        roofs = ROOF + rng.permutation(3)
-        materials = [*stones, *walls, *roofs, GOLD]
-        parts[:, 8] = np.take(materials, parts[:, 8].astype(int))
-    if background:
-        parts = concatenate([parts, TOWN])
-    return parts
+    """The landmark's parts, and the town's if there is a background."""
+    return toy_landmark(landmark) + TOWN * background
 
 
 def part_sdf(part, x):
-    """Distance to one part (9,), or to one part for each point (P,9). x (P,3) -> (P,)"""
-    shape, *_, half, bottom, top, depth, _ = part.T
-    x, y, z = (x - part[..., 1:4]).T
-    u = where(shape == 1, abs(x), hypot(x, y))
-    # In the plane of u and z: from the slanted side, which goes from bottom to top, and the caps.
-    grow = top - bottom
-    tall = 2 * half
-    k = ((u - bottom) * grow + (z + half) * tall) / (grow ** 2 + tall ** 2)
-    k = clip(k, 0, 1)
-    side_u = u - bottom - k * grow
-    side_z = z + half - k * tall
-    cap_u = maximum(u - where(z < 0, bottom, top), 0)
+    """Signed distance to a part, + and exact outside. (P,3) -> (P,)"""
+    x, y, z = (x - part.centre).T
+    if part.shape == "ground":
+        return z
+    if part.shape == "ball":
+        return np.hypot(np.hypot(x, y), z) - part.half[0]
+    # First in the plane of u, across, and z: the slanted side, then bottom and top.
+    u = abs(x) if part.shape == "box" else np.hypot(x, y)
+    bottom, top = part.widths
+    _, depth, half = part.half
+    slant = top - bottom
+    height = 2 * half
+    k = ((u - bottom) * slant + (z + half) * height) / (slant ** 2 + height ** 2)
+    k = np.clip(k, 0, 1)
+    side_u = u - bottom - k * slant
+    side_z = z + half - k * height
+    cap_u = np.maximum(u - np.where(z < 0, bottom, top), 0)
     cap_z = abs(z) - half
     is_inside = (side_u < 0) & (cap_z < 0)
-    d = where(is_inside, -1, 1) * minimum(hypot(side_u, side_z), hypot(cap_u, cap_z))
-    e = where(shape == 1, abs(y) - depth, -inf)
-    d = hypot(maximum(d, 0), maximum(e, 0)) + minimum(maximum(d, e), 0)
-    d = where(shape == 3, hypot(u, z) - bottom, d)
-    return where(shape == 0, z, d)
+    d = np.minimum(np.hypot(side_u, side_z), np.hypot(cap_u, cap_z))
+    d = np.where(is_inside, -d, d)
+    if part.shape == "column":
+        return d
+    e = abs(y) - depth
+    outside = np.hypot(np.maximum(d, 0), np.maximum(e, 0))
+    return outside + np.minimum(np.maximum(d, e), 0)
 
 
 def gradient(sdf, x, step):
-    """Of a distance (P,) by central differences. x (P,3) -> (P,3)"""
-    ends = [sdf(x + axis) - sdf(x - axis) for axis in step * eye(3)]
-    return stack(ends, 1) / (2 * step)
+    """Of a distance function, by central differences at x (P,3). -> (P,3)"""
+    ends = [sdf(x + axis) - sdf(x - axis) for axis in step * np.eye(3)]
+    return np.stack(ends, 1) / (2 * step)
 
 
 def toy_sdf(x_world, background=True, landmark=0):
-    """Signed distance of the toy, + and exact outside, SfM units. (P,3) -> (P,) float64"""
+    """Signed distance of the toy, + and exact outside, SfM units. (P,3) -> (P,)"""
     x = (x_world - TOY_ORIGIN) / TOY_SCALE
     distances = [part_sdf(part, x) for part in toy_parts(landmark, background)]
     return np.min(distances, axis=0) * TOY_SCALE
 
 
 def enter_part(part, o, d):
-    """Where rays o, d (R,3), seen from the part's centre, enter it; inf for a miss. -> (R,)
+    """Where rays o, d (R,3) enter a part; inf for a miss. -> (R,)
 
-    A part is where a quadric and up to two slabs overlap: a ray is inside between the last
-    entrance and the first exit."""
-    shape, *_, half, bottom, top, depth, _ = part
-    if shape == 0:
-        return where(d[:, 2] < -1e-3, -o[:, 2] / d[:, 2], inf)
-    n = int(shape)   # the quadric is round in the first n coordinates
-    flat_o, flat_d = o[:, :n], d[:, :n]
-    grow = (top - bottom) / half / 2
-    rise = grow * d[:, 2]
-    w = (bottom + top) / 2 + grow * o[:, 2]   # radius at the ray's start
-    a = (flat_d ** 2).sum(1) - rise ** 2
-    b = (flat_d * flat_o).sum(1) - rise * w
-    c = (flat_o ** 2).sum(1) - w * w
-    root = sqrt(b * b - a * c)   # nan for a miss
-    is_cone = a < 0   # such a ray is inside on one end, for ever
-    enter = where(is_cone & (rise < 0), -inf, (-b - root) / a)
-    leave = where(is_cone & (rise > 0), inf, (-b + root) / a)
+    A part is where a quadric and up to two slabs overlap. The quadric is round in the
+    first n coordinates, and its radius is linear in z: a roof has n = 1 and two slabs,
+    a cone n = 2 and one slab, a ball n = 3. A ray is inside between the last entrance
+    and the first exit.
+    """
+    o = o - part.centre
+    if part.shape == "ground":
+        return np.where(d[:, 2] < -1e-3, -o[:, 2] / d[:, 2], np.inf)
+    n = {"box": 1, "column": 2, "ball": 3}[part.shape]
+    bottom, top = part.widths
+    slope = (top - bottom) / part.half[2] / 2
+    rise = slope * d[:, 2]
+    radius = (bottom + top) / 2 + slope * o[:, 2]  # where the ray starts
+    a = (d[:, :n] ** 2).sum(1) - rise ** 2
+    b = (d[:, :n] * o[:, :n]).sum(1) - rise * radius
+    c = (o[:, :n] ** 2).sum(1) - radius * radius
+    root = np.sqrt(b * b - a * c)  # nan for a miss
+    enter = (-b - root) / a
+    leave = (-b + root) / a
+    is_steep = a < 0  # steeper than the cone: inside on one end, for ever
+    enter = np.where(is_steep & (rise < 0), -np.inf, enter)
+    leave = np.where(is_steep & (rise > 0), np.inf, leave)
     for axis in range(n, 3):
         middle = -o[:, axis] / d[:, axis]
-        reach = abs((depth, half)[axis - 1] / d[:, axis])
-        enter = maximum(enter, middle - reach)
-        leave = minimum(leave, middle + reach)
-    return where((enter < leave) & (enter > 0), enter, inf)
+        reach = abs(part.half[axis] / d[:, axis])
+        enter = np.maximum(enter, middle - reach)
+        leave = np.minimum(leave, middle + reach)
+    return np.where((enter < leave) & (enter > 0), enter, np.inf)
 
 
 @np.errstate(divide="ignore", invalid="ignore")
 def trace(o, d, parts):
-    """First hits of rays from o (R,3) or (1,3) along d, the same: distance (R,), inf is sky, and
-    number of the part (R,)"""
-    enter = stack([enter_part(part, o - part[1:4], d) for part in parts])
+    """First hits of rays from o (R,3) or (1,3) along d (R,3) or (1,3).
+
+    -> distance (R,), inf is sky, and number of the part (R,)
+    """
+    enter = np.stack([enter_part(part, o, d) for part in parts])
     return enter.min(0), enter.argmin(0)
 
 
-# Two ranges of hills: base and size as slopes, waves around the horizon, colour.
-HILLS = table("""
-    .11 .045 5 .25 .33 .45
-    .06 .03  9 .11 .18 .16
-""")
-
-
 def sky(d):
-    """Radiance of the sky and two ranges of hills. d (R,3) -> (R,3) linear"""
+    """Linear colour of the sky and two ranges of hills. d (R,3) -> (R,3)"""
     up = d[:, 2:]
-    azimuth = arctan2(d[:, :1], d[:, 1:2])
-    colour = (.58, .68, .78) - clip(up * 1.5, 0, 1) * (.52, .46, .26)
-    for base, size, waves, *hill in HILLS:
-        ridge = sin(waves * azimuth + base * 40) + 0.6 * sin(2.3 * waves * azimuth)
-        colour = where(up < base + size * ridge, hill, colour)
+    azimuth = np.arctan2(d[:, :1], d[:, 1:2])
+    colour = (0.58, 0.68, 0.78) - np.clip(up * 1.5, 0, 1) * (0.52, 0.46, 0.26)
+    for slope, swing, waves, hill in [
+        (0.11, 0.045, 5, (0.25, 0.33, 0.45)),
+        (0.06, 0.03, 9, (0.11, 0.18, 0.16)),
+    ]:
+        ridge = np.sin(waves * azimuth + slope * 40)
+        ridge = ridge + 0.6 * np.sin(2.3 * waves * azimuth)
+        colour = np.where(up < slope + swing * ridge, hill, colour)
     return colour
 
 
-def paint(x, part):
-    """Solid texture of cells at points of the surface: x (H,3), part (H,9) -> (H,3)"""
+def texture(name, across, up):
+    """Colours of a material's cells at two coordinates (P,) on a surface. -> (P,3)"""
+    colour, (width, height), contrast, has_windows = MATERIALS[name]
+    row = up / height
+    column = across / width
+    if not has_windows:
+        column = column + np.floor(row) % 2 / 2  # every other row of stones is shifted
+    chance = np.sin(12.9898 * np.floor(column) + 78.233 * np.floor(row))
+    chance = abs(chance) * 437.585 % 1
+    brightness = 1 + contrast * (2 * chance - 1)
+    if has_windows:
+        is_window = (abs(column % 1 - 0.5) < 0.2) & (abs(row % 1 - 0.45) < 0.28)
+        brightness = brightness * (1 - 0.8 * is_window)
+    return colour * brightness[:, None]
+
+
+def paint(part, x):
+    """Colours at points on a part's surface. (P,3) -> (P,3)"""
     x, y, z = x.T
-    shape, centre_x, centre_y = part.T[:3]
-    is_ground = shape == 0
-    is_meadow = is_ground & (hypot(x, y) >= 2.6)
-    material = MATERIALS[where(is_meadow, MEADOW, part[:, 8]).astype(int)]
-    width, height, contrast, windows = material.T[3:]
-    turn = arctan2(y - centre_y, x - centre_x)
-    across = where(is_ground, x, where(shape == 1, x + y, turn))
-    row = where(is_ground, y, z) / height
-    bond = floor(row) % 2 / 2 * (1 - windows)   # every other row of stones is shifted
-    column = across / width + bond
-    chance = abs(sin(12.9898 * floor(column) + 78.233 * floor(row))) * 437.585 % 1
-    is_window = (abs(column % 1 - .5) < .2) * (abs(row % 1 - .45) < .28)
-    brightness = (1 + contrast * (2 * chance - 1)) * (1 - .8 * windows * is_window)
-    return material[:, :3] * brightness[:, None]
+    if part.shape == "ground":
+        is_paved = np.hypot(x, y) < 2.6
+        return np.where(
+            is_paved[:, None], texture("paving", x, y), texture("meadow", x, y))
+    if part.shape == "box":
+        return texture(part.material, x + y, z)
+    turn = np.arctan2(y - part.centre[1], x - part.centre[0])
+    return texture(part.material, turn, z)
 
 
 def shade(o, d, parts, background, sun):
-    """Radiance along rays: sun, shadow, sky light and haze. o (1,3), d (R,3), sun (3,) -> (R,3)"""
+    """Linear colours along rays: sun, shadow, light of the sky, haze.
+
+    o (1,3), d (R,3), sun (3,) -> (R,3)
+    """
     colour = sky(d) * background
     t, which = trace(o, d, parts)
-    hit = t < inf
-    x = o + t[hit, None] * d[hit]
-    part = parts[which[hit]]   # (H,9)
-    normal = gradient(lambda x: part_sdf(part, x), x, 1e-5)
-    in_sun = trace(x + 1e-4 * normal, sun[None], parts)[0] == inf
-    light = (maximum(normal @ sun, 0) * in_sun)[:, None] * (1.15, 1.05, .88)
-    light += (0.20 + 0.10 * normal[:, 2:]) * (.8, .92, 1.15)
-    haze = np.exp(-maximum(t[hit, None] - 5, 0) / 20)
-    colour[hit] = haze * paint(x, part) * light + (1 - haze) * (.42, .50, .58)
+    hit = np.flatnonzero(t < np.inf)
+    t = t[hit, None]
+    x = o + t * d[hit]
+    normal = np.zeros_like(x)
+    surface = np.zeros_like(x)
+    for i in np.unique(which[hit]):
+        part = parts[i]
+        own = which[hit] == i
+        normal[own] = gradient(lambda x: part_sdf(part, x), x[own], 1e-5)
+        surface[own] = paint(part, x[own])
+    in_sun = trace(x + 1e-4 * normal, sun[None], parts)[0] == np.inf
+    sunlight = np.maximum(normal @ sun, 0) * in_sun
+    light = sunlight[:, None] * (1.15, 1.05, 0.88)
+    light += (0.20 + 0.10 * normal[:, 2:]) * (0.8, 0.92, 1.15)
+    clear = np.exp(-np.maximum(t - 5, 0) / 20)
+    colour[hit] = clear * surface * light + (1 - clear) * (0.42, 0.50, 0.58)
     return colour
 
 
-def rays(K, c2w, w, h, offset=(0.5, 0.5)):
-    """Unit directions through each pixel's offset, in world axes, row by row. -> (h*w,3)"""
+def ray_directions(K, c2w, w, h, offset=(0.5, 0.5)):
+    """Unit vectors through each pixel's offset, in world axes, row by row. -> (h*w,3)"""
     uv = np.indices((w, h)).T.reshape(-1, 2)
     xy = (uv + offset - K[2:]) / K[:2]
-    d = column_stack([xy, np.ones(w * h)])
+    d = np.column_stack([xy, np.ones(w * h)])
     d /= lengths(d)[:, None]
     return d @ c2w[:, :3].T
 
@@ -432,408 +507,573 @@ def project(K, c2w, x):
     """Pixels (P,2), -1e9 behind the camera, and distances (P,) of points x (P,3)."""
     p = (x - c2w[:, 3]) @ c2w[:, :3]
     z = p[:, 2:]
-    uv = p[:, :2] / maximum(z, 1 / FAR) * K[:2] + K[2:]
-    return where(z > 0, uv, -1e9), lengths(p)
+    uv = p[:, :2] / np.maximum(z, 1 / FAR) * K[:2] + K[2:]
+    return np.where(z > 0, uv, -1e9), lengths(p)
 
 
 def toy_camera(rng, azimuth, size):
-    """A tourist at `azimuth` [rad] from the front. -> K (4,), c2w (3,4) in the toy's units, w, h"""
+    """A tourist's camera at `azimuth` [rad] from the front, in the toy's units.
+
+    -> K (4,), c2w (3,4), width, height
+    """
     aspect = rng.choice([4 / 3, 3 / 2, 1.1, 3 / 4, 2 / 3])
     w = round(size * min(1, aspect))
     h = round(size * min(1, 1 / aspect))
-    f = size / 2 / np.tan(radians(rng.uniform(40, 65)) / 2)   # angle of view, along the long side
-    target = (0, .05, .80) + rng.uniform(-.12, .12, 3)
-    away = array([sin(azimuth), -np.cos(azimuth), rng.uniform(-.15, .45)])
+    angle = np.radians(rng.uniform(40, 65))  # of view, along the long side
+    f = size / 2 / np.tan(angle / 2)
+    target = (0, 0.05, 0.80) + rng.uniform(-0.12, 0.12, 3)
+    away = np.array([np.sin(azimuth), -np.cos(azimuth), rng.uniform(-0.15, 0.45)])
     away = away * f / min(w, h) * rng.uniform(2.0, 2.6)
-    place = target + away * rng.choice((0.8, 1), p=(.1, .9))
+    place = target + away * rng.choice((0.8, 1), p=(0.1, 0.9))
     place[2] = max(place[2], 0.2)
     z = target - place
     z /= norm(z)
-    x = cross(z, (*rng.normal(0, .03, 2), 1))   # hardly anyone holds it level
+    x = np.cross(z, (*rng.normal(0, 0.03, 2), 1))  # hardly anyone holds it level
     x /= norm(x)
-    c2w = stack([x, cross(z, x), z, place], 1)
+    c2w = np.stack([x, np.cross(z, x), z, place], 1)
     return (f, f, w / 2, h / 2), c2w, w, h
 
 
-# Legs, belts of the coat and head: both ends x y and width, in heights above the feet.
-STROKES = table("""
-    -.06 .03 -.06 .45 .10
-     .06 .03  .06 .45 .10
-    -.05 .50  .05 .50 .16
-    -.05 .56  .05 .56 .16
-    -.05 .62  .05 .62 .16
-    -.05 .68  .05 .68 .16
-    -.05 .74  .05 .74 .16
-      0  .92   0  .92 .15
-""")
+# A passer-by's strokes: both ends x y and width, in heights above the feet; whose colour.
+STROKES = [
+    ((-0.06, 0.03), (-0.06, 0.45), 0.10, "legs"),
+    ((0.06, 0.03), (0.06, 0.45), 0.10, "legs"),
+    ((-0.05, 0.50), (0.05, 0.50), 0.16, "coat"),
+    ((-0.05, 0.56), (0.05, 0.56), 0.16, "stripe"),
+    ((-0.05, 0.62), (0.05, 0.62), 0.16, "coat"),
+    ((-0.05, 0.68), (0.05, 0.68), 0.16, "stripe"),
+    ((-0.05, 0.74), (0.05, 0.74), 0.16, "coat"),
+    ((0, 0.92), (0, 0.92), 0.15, "skin"),
+]
 
 
 def draw_people(rng, w, h, share):
-    """Passers-by on about `share` of the photo. -> (h*w,4): colour times opacity, opacity"""
-    canvas = zeros((4 * h, 4 * w, 4), float32)   # drawn large, then averaged
+    """Passers-by on about `share` of the photo. -> (h*w,4): colour x opacity, opacity"""
+    canvas = np.zeros((4 * h, 4 * w, 4), np.float32)  # drawn large, then averaged
     left = share
     while left > max(0.1 * share, 0.002):
-        tall = sqrt(left * w * h / .25) * rng.uniform(.5, 1)
-        tall = 4 * clip(tall, .12 * h, .95 * h)
-        feet = rng.uniform((0, 3.2 * h), (4 * w, 4 * h + .2 * tall))
-        coat, legs, thing, skin = .02 + .83 * rng.beta(.4, .4, (4, 3))   # vivid, black or white
-        skin = (.3 + skin[:1]) * (.8, .6, .45)
-        stripe = thing if rng.random() < .4 else coat
-        spot = rng.uniform((-.25, .5), (.25, 1.15))   # of a bag, balloon or hat
-        end = spot + rng.uniform(-.15, .15, 2)
-        strokes = [*STROKES, (*spot, *end, rng.uniform(.08, .25))]
-        colours = legs, legs, coat, stripe, coat, stripe, coat, skin, thing
-        for colour, (*ends, wide) in zip(colours, strokes):
-            ends = feet + reshape(ends, (2, 2)) * (tall, -tall)
-            thickness = int(wide * tall) + 1
-            cv2.line(canvas, *ends.astype(int).tolist(), (*colour.tolist(), 1), thickness)
+        tall = np.sqrt(left * w * h / 0.25) * rng.uniform(0.5, 1)
+        tall = 4 * np.clip(tall, 0.12 * h, 0.95 * h)
+        feet = rng.uniform((0, 3.2 * h), (4 * w, 4 * h + 0.2 * tall))
+        vivid = 0.02 + 0.83 * rng.beta(0.4, 0.4, (4, 3))  # or black, or white
+        coat, legs, thing, skin = vivid
+        skin = (0.3 + skin[:1]) * (0.8, 0.6, 0.45)
+        stripe = thing if rng.random() < 0.4 else coat
+        colours = dict(coat=coat, legs=legs, thing=thing, skin=skin, stripe=stripe)
+        spot = rng.uniform((-0.25, 0.5), (0.25, 1.15))  # of a bag, balloon or hat
+        end = spot + rng.uniform(-0.15, 0.15, 2)
+        strokes = [*STROKES, (spot, end, rng.uniform(0.08, 0.25), "thing")]
+        for first, last, wide, whose in strokes:
+            ends = feet + np.array([first, last]) * (tall, -tall)
+            first, last = ends.astype(int).tolist()
+            colour = *colours[whose].tolist(), 1
+            cv2.line(canvas, first, last, colour, int(wide * tall) + 1)
         left = share - canvas[..., 3].mean()
     small = cv2.resize(canvas, (w, h), interpolation=cv2.INTER_AREA)
     return small.reshape(-1, 4).astype(float)
 
 
 def toy_points(rng, photos):
-    """As by SfM: noisy, 1.5 % wrong. photos: of each its view, surface (P,3), depth and people (P,)
-    -> points (K,5) as in finish, and those (M,) of each photo"""
-    x, tracks = [], []
+    """Points as by SfM: noisy, 1.5 % of them wrong.
+
+    photos: of each its view, surface (P,3), depth (P,) and people (P,)
+    -> points (K,5) as in build_scene, and the numbers of those that each photo sees
+    """
+    places = []
     count = 3000 // len(photos)
-    for _, surface, depth, hidden in photos:
-        ok = (depth < 30) & ~hidden
-        on = ok & (abs(surface - (0, 0, 1.02)) < (1.3, 1.3, 1)).all(1)   # the landmark
-        for some, n in (on, count), (ok & ~on, count // 5):
-            x.append(surface[rng.choice(flatnonzero(some), n * some.any())])
-    x = concatenate(x)
-    for (K, c2w, w, h), _, depth, hidden in photos:
+    for _, surface, depth, people in photos:
+        ok = (depth < 30) & ~people
+        is_near = (abs(surface - (0, 0, 1.02)) < (1.3, 1.3, 1)).all(1)  # the landmark
+        for some, n in [(ok & is_near, count), (ok & ~is_near, count // 5)]:
+            if some.any():
+                places.append(surface[rng.choice(np.flatnonzero(some), n)])
+    x = np.concatenate(places)
+    tracks = []
+    for (K, c2w, w, h), _, depth, people in photos:
         uv, distance = project(K, c2w, x)
-        at = clip(uv, 0, (w - 1, h - 1)).astype(int) @ (1, w)
-        ok = ((uv >= 0) & (uv < (w, h))).all(1)
-        ok &= abs(depth[at] / distance - 1) < .02
-        ok &= ~hidden[at] & (rng.random(len(x)) < .6)
-        tracks.append(flatnonzero(ok))
-    is_wrong = rng.random((len(x), 1)) < .015
+        pixel = np.clip(uv, 0, (w - 1, h - 1)).astype(int) @ (1, w)
+        is_inside = ((uv >= 0) & (uv < (w, h))).all(1)
+        is_visible = abs(depth[pixel] / distance - 1) < 0.02
+        is_visible &= is_inside & ~people[pixel]
+        is_found = rng.random(len(x)) < 0.6
+        tracks.append(np.flatnonzero(is_visible & is_found))
+    is_wrong = rng.random((len(x), 1)) < 0.015
     x += is_wrong * rng.uniform(-1, 1, x.shape)
-    x = (x + rng.normal(0, .005, x.shape)) * TOY_SCALE + TOY_ORIGIN
-    counts = bincount(concatenate(tracks), minlength=len(x))
-    return column_stack([x, 0 * counts, counts]), tracks
+    x += rng.normal(0, 0.005, x.shape)
+    views = np.bincount(np.concatenate(tracks), minlength=len(x))
+    error = np.zeros(len(x))
+    return np.column_stack([x * TOY_SCALE + TOY_ORIGIN, error, views]), tracks
 
 
 def shake_camera(rng, K, c2w, pixels):
-    """Moves c2w, in the toy's units, by noise that is `pixels` rms at the landmark."""
-    *turn, dx, dy = rng.normal(0, pixels / 2, 4) / K[0]   # half by turning, half by moving [rad]
+    """Moves c2w, in the toy's units, by noise of `pixels` rms at the landmark."""
+    *turn, dx, dy = rng.normal(0, pixels / 2, 4) / K[0]  # [rad]: turned, and moved
     c2w[:, 3] += c2w[:, :2] @ (dx, dy) * norm(c2w[:, 3])
     c2w[:, :3] @= cv2.Rodrigues((*turn, 0))[0]
 
 
-def make_toy(seed=0, size=96, photos=48, test=8, occluders=0.05, exposure=1.0, pose_noise=0.0,
-             background=True, landmark=0, sun=0.0):
-    """Scene of a procedural landmark, the same for every seed, another for every number. size: long
-    side [px]. occluders: mean share of a training photo that people cover, 0..0.6. exposure: spread
-    of brightness, white balance and contrast, 0 none, 1 tourists, 2 extreme. pose_noise: of the
-    training photos [px rms at the landmark]. background=False: nothing else, before black. sun: its
-    azimuth differs from photo to photo by up to this many degrees."""
-    info = dict(locals(), scene="toy", kind="toy", downscale=1, folder=None, split=None)
-    is_sound = occluders <= 0.6 and exposure <= 2 and sun <= 180 and pose_noise < inf
+def make_toy(seed=0, size=96, photos=48, test=8, occluders=0.05, exposure=1.0,
+             pose_noise=0.0, background=True, landmark=0, sun=0.0):
+    """Scene of a procedural landmark, the same for every seed.
+
+    size: long side of a photo [px]
+    occluders: mean share of a training photo that people cover, 0 to 0.6
+    exposure: spread of brightness, white balance and contrast; 1 as of tourists, 0 to 2
+    pose_noise: of the training photos [px rms at the landmark]
+    background: False leaves nothing but the landmark, before black
+    landmark: another building for every number
+    sun: its azimuth differs from photo to photo by up to so many degrees
+    """
+    info = dict(
+        locals(), scene="toy", kind="toy", downscale=1, folder=None, split=None)
+    is_sound = occluders <= 0.6 and exposure <= 2 and sun <= 180 and pose_noise < np.inf
     is_sound &= min(seed, test, occluders, exposure, pose_noise, landmark, sun) >= 0
     check(is_sound and size >= 16 and photos >= 4,
-          "occluders in 0..0.6, exposure 0..2, sun 0..180, size >= 16, photos >= 4, others >= 0")
+          "occluders in 0..0.6, exposure 0..2, sun 0..180, size >= 16, photos >= 4, "
+          "others >= 0")
     # No knob changes another's random numbers.
-    camera, taste, people, sfm, shake, day = [default_rng([seed, k]) for k in range(6)]
+    generators = [np.random.default_rng([seed, k]) for k in range(6)]
+    camera, taste, people, sfm, shake, day = generators
     count = photos + test
-    angles = 200 * (arange(count) + camera.uniform(.1, .9, count)) / count - 100
-    views = [toy_camera(camera, angle, size) for angle in radians(angles)]
-    is_test = np.isin(arange(count), (arange(test) + 0.5) * count // test)
-    share = people.gamma(0.8 + 6 * occluders, size=count) * ~is_test   # some photos stay free
-    share = minimum(share / share.sum() * photos * occluders, 0.85)
-    turns = radians(day.uniform(-sun, sun, count))
+    numbers = np.arange(count)
+    angles = 200 * (numbers + camera.uniform(0.1, 0.9, count)) / count - 100
+    views = [toy_camera(camera, angle, size) for angle in np.radians(angles)]
+    is_test = np.isin(numbers, (np.arange(test) + 0.5) * count // test)
+    share = people.gamma(0.8 + 6 * occluders, size=count)  # some photos stay free
+    share = share * ~is_test
+    share = np.minimum(share / share.sum() * photos * occluders, 0.85)
+    turns = np.radians(day.uniform(-sun, sun, count))
     parts = toy_parts(landmark, background)
-    depth, surface, images, occluder = [], [], [], []   # of each photo
-    for i in progress(range(count), "drawing photos"):
+    depth, surface, images, occluder = [], [], [], []  # of each photo
+    for i in progress(numbers, "drawing photos"):
         _, c2w, w, h = views[i]
         o = c2w[None, :, 3]
         to_sun = cv2.Rodrigues((0, 0, turns[i]))[0] @ SUN
         linear = 0
-        for offset in itertools.product((.25, .75), repeat=2):   # places in a pixel
-            d = rays(*views[i], offset)
-            linear += clip(shade(o, d, parts, background, to_sun), 0, 1) / 4
+        for offset in itertools.product((0.25, 0.75), repeat=2):  # places in a pixel
+            d = ray_directions(*views[i], offset)
+            colour = shade(o, d, parts, background, to_sun)
+            linear = linear + np.clip(colour, 0, 1) / 4
         cover = draw_people(people, w, h, share[i])
-        linear = linear * (1 - cover[:, 3:]) + cover[:, :3]   # (h*w,3)
+        linear = linear * (1 - cover[:, 3:]) + cover[:, :3]  # (h*w,3)
         brightness, red, blue, contrast = exposure * taste.uniform(-1, 1, 4)
-        gain = 2 ** (brightness / 2) * array([1 + .1 * red, 1, 1 + .1 * blue])
-        srgb = clip(linear * gain, 0, 1) ** (1.2 ** contrast / 2.2)
-        images.append((srgb * 255 + 0.5).astype(uint8).reshape(h, w, 3))
-        d = rays(*views[i])
+        gain = 2 ** (brightness / 2) * np.array([1 + 0.1 * red, 1, 1 + 0.1 * blue])
+        srgb = np.clip(linear * gain, 0, 1) ** (1.2 ** contrast / 2.2)
+        images.append((srgb * 255 + 0.5).astype(np.uint8).reshape(h, w, 3))
+        d = ray_directions(*views[i])
         t, _ = trace(o, d, parts)
         depth.append(t)
         surface.append(o + t[:, None] * d)
         occluder.append(cover[:, 3] > 0)
     points, tracks = toy_points(sfm, list(zip(views, surface, depth, occluder)))
-    for (K, c2w, *_), held_out in zip(views, is_test):
+    for (K, c2w, _, _), held_out in zip(views, is_test):
         shake_camera(shake, K, c2w, pose_noise * (not held_out))
         c2w[:, 3] = c2w[:, 3] * TOY_SCALE + TOY_ORIGIN
-    building = parts[:len(LANDMARK), None]   # all of it belongs in the unit sphere
-    signs = list(itertools.product((-1, 1), repeat=3))
-    corners = building[..., 1:4] + building[..., [5, 7, 4]] * signs   # (P,8,3)
-    K, c2w, *_ = zip(*views)
-    name = [f"toy_{i:03d}.png" for i in range(count)]
-    scene = finish(images, K, c2w, is_test, name, points, tracks, info,
-                   contain=corners * TOY_SCALE + TOY_ORIGIN)
-    scene["depth"] = (concatenate(depth) * TOY_SCALE / scene["scale"]).astype(np.float16)
-    scene["occluder"] = concatenate(occluder)
-    walls = concatenate(surface)[::9] * TOY_SCALE + TOY_ORIGIN
+    signs = np.array(list(itertools.product((-1, 1), repeat=3)))
+    corners = [part.centre + part.half * signs for part in toy_landmark(landmark)]
+    K, c2w, _, _ = zip(*views)
+    scene = build_scene(
+        images, K, c2w, is_test, [f"toy_{i:03d}.png" for i in numbers], points, tracks,
+        info, contain=np.array(corners) * TOY_SCALE + TOY_ORIGIN)
+    depth = np.concatenate(depth) * TOY_SCALE / scene["scale"]
+    scene["depth"] = depth.astype(np.float16)
+    scene["occluder"] = np.concatenate(occluder)
+    walls = np.concatenate(surface)[::9] * TOY_SCALE + TOY_ORIGIN
     walls = (walls - scene["center"]) / scene["scale"]
     walls = walls[lengths(walls) < 0.95]
     return scene | toy_walls(scene, walls, background, landmark)
 
 
 def toy_walls(scene, wall, background, landmark):
-    """What scores of geometry need, in scene units: visible walls (P,3) where they are smooth and
-    their normals; points near walls, and the true signed distance there."""
-    def sdf(x):   # (P,3) -> (P,)
+    """The arrays of TOY_FORMAT about surfaces, from visible points wall (P,3)."""
+    def sdf(x):  # (P,3) -> (P,), scene units
         world = x * scene["scale"] + scene["center"]
         return toy_sdf(world, background, landmark) / scene["scale"]
 
     normal = gradient(sdf, wall, 0.004)
     is_smooth = abs(lengths(normal) - 1) < 0.01
-    near = wall + default_rng(0).normal(0, 0.02, wall.shape)
+    near = wall + np.random.default_rng(0).normal(0, 0.02, wall.shape)
     s = sdf(near)
     is_near = abs(s) < 0.05
-    return dict(wall=wall[is_smooth], wall_normal=normal[is_smooth], near_wall=near[is_near],
-                near_wall_sdf=s[is_near])
+    return dict(
+        wall=wall[is_smooth],
+        wall_normal=normal[is_smooth],
+        near_wall=near[is_near],
+        near_wall_sdf=s[is_near])
 
 
-# ---- from photos, poses and points to a scene ----------------------------------------------------
+# ---- from photos, poses and points to a scene ------------------------------------------
 def find_sphere(x, weight, tracks, is_test, contain):
     """Centre (3,) and radius of what most photos look at; its definition is [D10].
 
-    Centre: geometric median of points x (K,3) by weight. Radius: 1.1 x the distance of 95 %; if it
-    is a skyline, more than four times the median distance away, only nearer points are counted.
-    Inside are at least 30 % of the points (M,) of most training photos, and contain (...,3)."""
-    centre = median(x, axis=0)
-    for _ in range(20):   # Weiszfeld
-        w = weight / maximum(lengths(x - centre), 1e-9)
+    Centre: geometric median of points x (K,3) by weight. Radius: 1.1 x the distance of
+    95 %; if that is a skyline, more than four times the median distance away, only
+    nearer points are counted. Inside are at least 30 % of the points (M,) of most
+    training photos, and contain (...,3).
+    """
+    centre = np.median(x, axis=0)
+    for _ in range(20):  # Weiszfeld
+        w = weight / np.maximum(lengths(x - centre), 1e-9)
         centre = w @ x / w.sum()
-    distance = lengths(x - centre)   # (K,)
-    counted = repeat(distance, weight)
-    limit = 4 * median(counted)
-    if quantile(counted, 0.95) > limit:
+    distance = lengths(x - centre)  # (K,)
+    counted = np.repeat(distance, weight)
+    limit = 4 * np.median(counted)
+    if np.quantile(counted, 0.95) > limit:
         counted = counted[counted <= limit]
-    radius = 1.1 * quantile(counted, 0.95, method="inverted_cdf")
-    reach = [quantile(distance[own], 0.3)
-             for own, held_out in zip(tracks, is_test) if len(own) and not held_out]
-    check(reach, "no training photo observes a usable 3D point: they do not belong together")
-    corners = lengths(reshape(contain, (-1, 3)) - centre)
-    radius = max(radius, median(reach), *1.02 * corners)
+    radius = 1.1 * np.quantile(counted, 0.95, method="inverted_cdf")
+    reach = [
+        np.quantile(distance[own], 0.3)
+        for own, held_out in zip(tracks, is_test)
+        if len(own) and not held_out
+    ]
+    check(reach,
+          "no training photo observes a usable 3D point: they do not belong together")
+    corners = lengths(np.reshape(contain, (-1, 3)) - centre)
+    radius = max(radius, np.median(reach), *1.02 * corners)
     check(radius > 1 / FAR, "all 3D points coincide: run SfM again")
     return centre, radius
 
 
-def finish(images, K, c2w, is_test, name, points, tracks, info, contain=()):
-    """The scene of images (h,w,3), each of which observes the points tracks (M,). SfM units: c2w;
-    points (K,5): x y z, error [px], views; contain (...,3)."""
+def build_scene(
+        images, K, c2w, is_test, name, points, tracks, info, contain=(), masks=None):
+    """The scene of images (h,w,3), each of which sees the points tracks (M,).
+
+    SfM units: c2w; points (K,5): x y z, error [px], views; contain (...,3).
+    masks: of each photo (h,w) bool, True is left out.
+    """
     error, views = points[:, 3:].T
     usable = views >= 3
     if usable.sum() < 500:
         usable = views >= 2
-    check(usable.sum() >= 20, f"{usable.sum()} usable 3D points: SfM needs more overlapping photos")
-    usable &= error <= quantile(error[usable], 0.95)
-    new_index = cumsum(usable) - 1
+    check(usable.sum() >= 20,
+          f"{usable.sum()} usable 3D points: SfM needs more overlapping photos")
+    usable &= error <= np.quantile(error[usable], 0.95)
+    new_index = np.cumsum(usable) - 1
     tracks = [new_index[own[usable[own]]] for own in tracks]
     x = points[usable, :3]
-    weight = minimum(views[usable], 20).astype(int)
+    weight = np.minimum(views[usable], 20).astype(int)
     centre, radius = find_sphere(x, weight, tracks, is_test, contain)
-    c2w = array(c2w)
+    c2w = np.array(c2w)
     c2w[:, :, 3] = (c2w[:, :, 3] - centre) / radius
-    wh = array([image.shape[1::-1] for image in images])
+    wh = np.array([image.shape[1::-1] for image in images])
     arrays = dict(
-        rgb=concatenate([image.reshape(-1, 3) for image in images]),
-        start=cumsum([0, *wh.prod(1)]),
-        wh=wh, K=K, c2w=c2w, is_test=is_test, name=name, info=json.dumps(info),
-        points=(x - centre) / radius, center=centre, scale=radius,
-        track_photo=repeat(arange(len(wh)), list(map(len, tracks))),
-        track_point=concatenate(tracks))
-    scene = {key: np.asarray(value, FORMAT[key].split()[0]) for key, value in arrays.items()}
-    return statistics(scene)
+        rgb=np.concatenate([image.reshape(-1, 3) for image in images]),
+        start=np.cumsum([0, *wh.prod(1)]),
+        wh=wh,
+        K=K,
+        c2w=c2w,
+        is_test=is_test,
+        name=name,
+        points=(x - centre) / radius,
+        track_photo=np.repeat(np.arange(len(wh)), [len(own) for own in tracks]),
+        track_point=np.concatenate(tracks),
+        center=centre,
+        scale=radius,
+        info=json.dumps(info))
+    scene = {}
+    for key, value in arrays.items():
+        dtype, _ = FORMAT[key]
+        scene[key] = np.asarray(value, dtype)
+    if masks:
+        scene["masked"] = np.concatenate([mask.ravel() for mask in masks])
+    return add_statistics(scene)
 
 
-def statistics(scene):
-    """Adds what geonvs.py decides by. near (I,): 0.8 x the 2 % quantile of the distances of a
-    photo's points, >= 0.02. Of the training photos: footprint, lower quartile of a pixel's size at
-    points in the sphere; exposure_spread, deviation of brightness (0..1) at equal points; bg_color
-    (3,), beyond the sphere; NaN unless 60 % agree."""
+def add_statistics(scene):
+    """Adds the arrays of FORMAT that geonvs.py decides by.
+
+    near: 0.8 x the 2 % quantile of the distances of a photo's points, >= 0.02. Of the
+    training photos, without masked pixels: footprint, lower quartile of a pixel's size at
+    points in the sphere; exposure_spread, deviation of brightness at equal points;
+    bg_color, seen by rays that miss the sphere, NaN unless 60 % agree.
+    """
     rgb = scene["rgb"]
+    masked = scene.get("masked", np.zeros(len(rgb), bool))
     step = max(1, len(rgb) // 500_000)
-    near, places = [], []   # of all photos
-    observed, size, bright, beyond = [], [], [], []   # of the training photos
+    near, places = [], []  # of all photos
+    observed, sizes, brightness, background = [], [], [], []  # of the training photos
     photos = zip(scene["start"], scene["K"], scene["c2w"], scene["wh"])
     for i, (first, K, c2w, wh) in enumerate(photos):
         own = scene["track_point"][scene["track_photo"] == i]
         x = scene["points"][own]
         uv, distance = project(K, c2w, x)
-        places.append(clip(uv / wh, -1, 2))
-        near.append(max(0.8 * quantile(distance, 0.02), 0.02) if len(own) else 0.05)
+        places.append(np.clip(uv / wh, -1, 2))
+        near.append(max(0.8 * np.quantile(distance, 0.02), 0.02) if len(own) else 0.05)
         if scene["is_test"][i]:
             continue
-        at = clip(uv, 0, wh - 1).astype(int) @ (1, wh[0])
-        observed.append(own)
-        size.append(distance[lengths(x) < 1] / K[0])
-        bright.append(rgb[first + at].mean(1) / 255)
+        sizes.append(distance[lengths(x) < 1] / K[0])
+        pixel = first + np.clip(uv, 0, wh - 1).astype(int) @ (1, wh[0])
+        is_seen = ~masked[pixel]
+        observed.append(own[is_seen])
+        brightness.append(rgb[pixel[is_seen]].mean(1) / 255)
         o = c2w[:, 3]
-        d = rays(K, c2w, *wh)
-        closest = o - minimum(d @ o, 0)[:, None] * d   # to the centre, along each ray
-        misses = flatnonzero(lengths(closest) > 1)
-        beyond.append(rgb[first + misses[::step]])
-    every = concatenate(observed)
-    mean = bincount(every, concatenate(bright)) / maximum(bincount(every), 1)   # (K,)
-    offsets = [median(b - mean[own]) for b, own in zip(bright, observed) if len(own)]
-    beyond = concatenate(beyond)
+        d = ray_directions(K, c2w, *wh)
+        closest = o - np.minimum(d @ o, 0)[:, None] * d  # to the centre, along each ray
+        is_miss = lengths(closest) > 1
+        is_miss &= ~masked[first:first + len(d)]
+        background.append(rgb[first + np.flatnonzero(is_miss)[::step]])
+    points = np.concatenate(observed)
+    mean = np.bincount(points, np.concatenate(brightness))
+    mean /= np.maximum(np.bincount(points), 1)  # (K,)
+    offsets = [
+        np.median(b - mean[own]) for b, own in zip(brightness, observed) if len(own)]
+    background = np.concatenate(background)
     color = np.full(3, np.nan)
-    if len(beyond) > 100:   # fewer may all be people
-        typical = median(beyond, 0)
-        agree = (abs(beyond - typical) < 5.1).all(1)
+    if len(background) > 100:  # fewer may all be people
+        typical = np.median(background, 0)
+        agree = (abs(background - typical) < 5.1).all(1)
         if agree.mean() > 0.6:
             color = typical / 255
     return scene | dict(
-        near=float32(near),
-        track_uv=concatenate(places, dtype=float32),
-        footprint=quantile(concatenate(size), 0.25),
-        exposure_spread=std(offsets),
+        near=np.float32(near),
+        track_uv=np.concatenate(places, dtype=np.float32),
+        footprint=np.quantile(np.concatenate(sizes), 0.25),
+        exposure_spread=np.std(offsets) if offsets else np.float64(0),
         bg_color=color)
 
 
-# ---- folders with photos and COLMAP models -------------------------------------------------------
-PHOTO_TYPES = ".jpg .jpeg .png .tif .tiff .bmp .webp .ppm .pgm .jp2 .avif .heic".split()
-# By COLMAP's number of a camera model: how many numbers it has; and how many focal lengths, which
-# come first, before centre and distortion, 0 for fisheyes and other models.
-PARAMETERS, FOCAL_LENGTHS = table("""
-    3 4 4 5 8 8 12 5 4 5 12 16 4 5 3 4 6 2
-    1 2 1 1 2 0  2 0 0 0  0  0 0 0 0 0 0 0
-""").astype(int)
+# ---- folders with photos, masks and COLMAP models --------------------------------------
+PHOTO_TYPES = (
+    ".jpg .jpeg .png .tif .tiff .bmp .webp .ppm .pgm .jp2 .avif .heic .heif".split())
+# COLMAP's camera models in the order of their numbers, with their parameters.
+CAMERA_MODELS = dict(
+    SIMPLE_PINHOLE="f cx cy",
+    PINHOLE="fx fy cx cy",
+    SIMPLE_RADIAL="f cx cy k1",
+    RADIAL="f cx cy k1 k2",
+    OPENCV="fx fy cx cy k1 k2 p1 p2",
+    OPENCV_FISHEYE="fx fy cx cy k1 k2 k3 k4",
+    FULL_OPENCV="fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6",
+    FOV="fx fy cx cy omega",
+    SIMPLE_RADIAL_FISHEYE="f cx cy k",
+    RADIAL_FISHEYE="f cx cy k1 k2",
+    THIN_PRISM_FISHEYE="fx fy cx cy k1 k2 p1 p2 k3 k4 sx1 sy1",
+    RAD_TAN_THIN_PRISM_FISHEYE="fx fy cx cy k0 k1 k2 k3 k4 k5 p0 p1 s0 s1 s2 s3",
+    SIMPLE_DIVISION="f cx cy k",
+    DIVISION="fx fy cx cy k",
+    SIMPLE_FISHEYE="f cx cy",
+    FISHEYE="fx fy cx cy",
+    EUCM="fx fy cx cy alpha beta",
+    EQUIRECTANGULAR="w h",
+)
+PERSPECTIVE = "SIMPLE_PINHOLE PINHOLE SIMPLE_RADIAL RADIAL OPENCV FULL_OPENCV".split()
+OPENCV_DISTORTION = "k1 k2 p1 p2 k3 k4 k5 k6".split()
 
 
 def open_binary(path):
-    """A function that reads the next values of a little-endian file, by a layout of struct's."""
+    """A function that reads the next values of a little-endian file, by struct's layouts."""
     check(path.is_file(),
-          f"{path} is missing: copy the whole model, or for points run colmap point_triangulator")
+          f"{path} is missing: copy the whole model, or for points run "
+          "colmap point_triangulator")
     file = io.BytesIO(path.read_bytes())
 
     def read(layout):
         try:
             record = struct.Struct("<" + layout)
             return record.unpack(file.read(record.size))
-        except struct.error as e:   # too few bytes are left, or none could be enough
-            raise UserError(f"{path} ends too early: copy it again, or delete its folder") from e
+        except struct.error as e:  # too few bytes are left, or none could be enough
+            says = f"{path} ends too early: copy it again, or delete its folder"
+            raise UserError(says) from e
     return read
 
 
-def read_photos(sparse):
-    """{name: (camera, pose (7,), ids of points)} of a COLMAP model. camera: wh, K (4,), k1 k2 p1 p2
-    k3 .. k6 of OpenCV; None if it is missing, a fisheye or of another unknown kind."""
-    cameras, photos = {}, {}
+def read_cameras(sparse):
+    """{number: (wh, K (4,), OPENCV_DISTORTION (8,))} of a model's perspective cameras."""
+    cameras = {}
     read = open_binary(sparse / "cameras.bin")
-    for _ in range(*read("Q")):
-        key, model, *wh = read("IiQQ")
-        check(0 <= model < len(PARAMETERS),
-              f"{sparse} has camera model {model}, which is unknown: run colmap image_undistorter")
-        numbers = np.append(read(f"{PARAMETERS[model]}d"), zeros(8))
-        n = FOCAL_LENGTHS[model]
-        if n:
-            cameras[key] = wh, numbers[[0, n - 1, n, n + 1]], numbers[n + 2:n + 10]
+    (count,) = read("Q")
+    for _ in range(count):
+        number, kind, *wh = read("IiQQ")
+        check(0 <= kind < len(CAMERA_MODELS),
+              f"{sparse} has camera model {kind}, which is unknown: run "
+              "colmap image_undistorter")
+        kind, names = list(CAMERA_MODELS.items())[kind]
+        names = names.split()
+        value = dict(zip(names, read(f"{len(names)}d")))
+        if kind in PERSPECTIVE:
+            f = value.get("f")
+            K = [value.get("fx", f), value.get("fy", f), value["cx"], value["cy"]]
+            distortion = [value.get(name, 0.0) for name in OPENCV_DISTORTION]
+            cameras[number] = wh, np.array(K), np.array(distortion)
+    return cameras
+
+
+def read_photos(sparse):
+    """{name: (camera or None, pose (7,), ids of its points)} of a COLMAP model."""
+    cameras = read_cameras(sparse)
+    photos = {}
     read = open_binary(sparse / "images.bin")
-    for _ in range(*read("Q")):
+    (count,) = read("Q")
+    for _ in range(count):
         _, *pose, camera = read("I7dI")
         letters = iter(lambda: read("c")[0], b"\0")
-        name = b"".join(letters).decode(errors="replace").replace("\\", "/")   # of Windows
-        (count,) = read("Q")
-        ids = read(f"{3 * count}Q")[2::3]   # of u, v, point
+        name = b"".join(letters).decode(errors="surrogateescape")
+        name = name.replace("\\", "/")  # of Windows
+        (sightings,) = read("Q")
+        ids = read(f"{3 * sightings}Q")[2::3]  # of u, v, point
         check(name not in photos and not {"", ".."} & set(name.split("/")),
-              f"{sparse}: photo {name!r} occurs twice or lies outside the image folder: rename it")
-        photos[name] = cameras.get(camera), array(pose), ids
+              f"{sparse}: photo {name!r} occurs twice or lies outside the image folder: "
+              "rename it")
+        photos[name] = cameras.get(camera), np.array(pose), ids
     return photos
 
 
 def check_photo(camera, pose, is_test):
     """UserError, a sentence about the photo, unless it can be used."""
-    check(camera, "has no camera in the model, or a fisheye: run colmap image_undistorter")
+    check(camera,
+          "has no camera in the model, or a fisheye: run colmap image_undistorter")
     wh, K, distortion = camera
-    numbers = concatenate([K, distortion, pose])
+    numbers = np.concatenate([K, distortion, pose])
     is_sound = (abs(numbers) < FAR).all() and min(K[:2]) > 1 / FAR and pose[:4].any()
     check(is_sound and max(wh) < 32767, "has no sound camera or pose: run SfM again")
     angle = 2 * np.degrees(np.arctan(max(wh / K[:2]) / 2))
-    check(is_test or 10 <= angle <= 120, f"is {angle:.1f} degrees wide, which is not in 10..120")
+    check(is_test or 10 <= angle <= 120,
+          f"is {angle:.1f} degrees wide, which is not in 10..120")
 
 
 def camera_to_world(pose):
-    """COLMAP's rotation from world to camera, a quaternion, and translation (7,) -> c2w (3,4)"""
-    w, *v = pose[:4] / norm(pose[:4])   # old files are not normalised
-    turn = cross(v, eye(3))
-    R = eye(3) + 2 * w * turn + 2 * turn @ turn
-    return column_stack([R, -R @ pose[4:]])
+    """COLMAP's world to camera, quaternion and translation (7,) -> c2w (3,4)"""
+    w, *v = pose[:4] / norm(pose[:4])  # old files are not normalised
+    turn = np.cross(v, np.eye(3))
+    R = np.eye(3) + 2 * w * turn + 2 * turn @ turn
+    return np.column_stack([R, -R @ pose[4:]])
 
 
 def read_points(sparse):
-    """Points (K,5) of a COLMAP model, as in finish, and {id: row} of them."""
-    read = open_binary(sparse / "points3D.bin")
+    """Points (K,5) of a COLMAP model, as in build_scene, and {id: row} of them."""
     points, rows = [], {}
-    for _ in range(*read("Q")):
+    read = open_binary(sparse / "points3D.bin")
+    (count,) = read("Q")
+    for _ in range(count):
         key, x, y, z, *_, error, views = read("Q3d3BdQ")
-        read(f"{2 * views}I")   # the track: photos list their points
+        read(f"{2 * views}I")  # the track: photos list their points
         rows[key] = len(points)
         points.append((x, y, z, error, views))
-    points = array(points, float).reshape(-1, 5)
-    points[~(abs(points) < FAR).all(1)] = 0   # nan as well: nobody sees them
+    points = np.array(points, float).reshape(-1, 5)
+    points[~(abs(points) < FAR).all(1)] = 0  # nan as well: nobody sees them
     check((points[:, 4] > 1).any(),
           f"no point of {sparse} has a track: run colmap point_triangulator on it")
     return points, rows
 
 
-def below(folder, name):
-    """Paths of that name, at most six levels down; links are followed, unlike by rglob."""
-    found = []
-    for depth in range(7):
-        found += sorted(folder.glob("*/" * depth + name))
-    return found
+def files_below(folder, levels=7):
+    """Files at most so many levels down, without hidden folders and thumbnails.
+
+    Links are followed, unlike by rglob; broken ones are files.
+    """
+    files = []
+    if levels and folder.is_dir():
+        for path in sorted(folder.iterdir()):
+            if path.name.startswith((".", "@")):  # NAS boxes write @eaDir
+                continue
+            files += files_below(path, levels - 1) if path.is_dir() else [path]
+    return files
 
 
 def photo_files(folder):
-    """{name: path} of the photos below a folder; dense/ holds copies of those outside it."""
+    """{name: path} of the photos below a folder, without masks/ and copies in dense/."""
     files = {}
-    for path in below(folder, "[!.]*"):
+    for path in files_below(folder):
         name = path.relative_to(folder)
-        if path.suffix.lower() in PHOTO_TYPES and name.parts[0] != "dense":
+        is_photo = path.suffix.lower() in PHOTO_TYPES
+        if is_photo and name.parts[0] not in ("dense", "masks"):
             files[name.as_posix()] = path
     return files
 
 
+def mask_files(images, names):
+    """{photo: path of its mask}; masks/ lies beside the folder of photos or in it."""
+    folder = images / "masks"
+    if not folder.is_dir():
+        folder = images.parent / "masks"
+    files = {path.relative_to(folder).as_posix(): path for path in files_below(folder)}
+    masks = {}
+    for name in names:
+        other = str(PurePosixPath(name).with_suffix(".png"))
+        for candidate in (other, name + ".png", name):
+            if candidate in files:
+                masks[name] = files[candidate]
+                break
+    if files and not masks:
+        warn(f"{folder} is not used: no name in it, such as {min(files)}, is a photo's")
+    return masks
+
+
+def match_names(wanted, there):
+    """{wanted name: its name there}: equal, or else equal but for case and Unicode form.
+
+    The latter only if no second name is alike.
+    """
+    found = {name: name for name in wanted if name in there}
+    alike = defaultdict(lambda: ([], []))
+    for side, names in enumerate([set(wanted) - found.keys(), set(there) - found.keys()]):
+        for name in names:
+            plain = unicodedata.normalize("NFC", name).casefold()
+            alike[unicodedata.normalize("NFC", plain)][side].append(name)
+    for ours, theirs in alike.values():
+        if len(ours) == len(theirs) == 1:
+            found[ours[0]] = theirs[0]
+    return found
+
+
+def nearest(name, names):
+    """A hint at the name that may be meant, or nothing."""
+    stem = PurePosixPath(name).stem
+    close = [other for other in names if PurePosixPath(other).stem == stem]
+    close += difflib.get_close_matches(name, names, 1)
+    return f"; there is {close[0]!r}" if close else ""
+
+
 def open_model(folder, sparse):
-    """A model with that folder of photos around it in which most of its photos are."""
+    """A model, with that folder around it in which most of its photos are."""
     photos = read_photos(sparse)
     places = []
     for place in (sparse, *sparse.parents):
         places += [place / "images", place / "input", place]
         if place == folder:
             break
-    images = max(places, key=lambda place: len(photos.keys() & photo_files(place)))
-    files = photo_files(images)
-    names = sorted(photos.keys() & files)   # posed, and on disk
-    count = sum(photos[name][0] is not None for name in names)   # with a camera
+    on_disk = [photo_files(place) for place in places]
+    matches = [match_names(photos, files) for files in on_disk]
+    best = max(range(len(places)), key=lambda i: len(matches[i]))
+    files = {name: on_disk[best][other] for name, other in matches[best].items()}
+    usable = [name for name in files if photos[name][0] is not None]  # with a camera
     return SimpleNamespace(
-        sparse=sparse, photos=photos, images=images, files=files, names=names, count=count)
+        sparse=sparse,
+        photos=photos,
+        images=places[best],
+        on_disk=list(on_disk[best]),
+        files=files,  # of the photos that are posed, and on disk
+        count=len(usable))
+
+
+def model_folders(folder):
+    return [path.parent for path in files_below(folder) if path.name == "images.bin"]
 
 
 def find_model(folder, command):
-    """The model in the folder with most photos; says what that leaves out."""
-    models = [open_model(folder, path.parent) for path in below(folder, "images.bin")]
-    check(models, f"{folder} has no binary COLMAP model: run python data_prep.py {command}, or for "
-          "a text model colmap model_converter --output_type BIN")
+    """The model in the folder with most photos; tells what that leaves out."""
+    models = [open_model(folder, sparse) for sparse in model_folders(folder)]
+    if not models and folder.name in ("images", "input"):
+        parent = Path(os.path.abspath(folder)).parent
+        check(not model_folders(parent),
+              f"{folder} has no COLMAP model, the folder around it has: give {parent}")
+    check(models,
+          f"{folder} has no binary COLMAP model: run python data_prep.py {command}, or for a "
+          "text model colmap model_converter --output_type BIN")
     best = max(models, key=lambda model: model.count)
+    check(best.photos,
+          f"{best.sparse} is an empty model, no photo is posed: delete it and run "
+          f"python data_prep.py {command}")
     lost = sorted(best.photos.keys() - best.files)
-    says = f"{len(lost)} photos of {best.sparse} are not on disk, such as {lost[:1]}"
-    check(best.names,
-          f"{says}: put them into {folder}/images, or run python data_prep.py {command}")
     if lost:
+        hint = nearest(lost[0], best.on_disk)
+        says = f"{len(lost)} photos of {best.sparse} are not on disk, such as {lost[0]!r}{hint}"
+        check(best.files,
+              f"{says}: put them into {folder / 'images'}, or run "
+              f"python data_prep.py {command}")
         warn(says)
-    on_disk = max(len(model.files) for model in models)
-    print(f"{best.images}: {on_disk} photos on disk, {len(best.names)} posed by {best.sparse}")
+    print(f"{best.images}: {max(len(model.on_disk) for model in models)} photos on disk, "
+          f"{len(best.files)} posed by {best.sparse}")
     for model in models:
         if model.photos.keys() != best.photos.keys():
             print(f"left out is another model: {len(model.photos)} posed by {model.sparse}")
@@ -843,125 +1083,246 @@ def find_model(folder, command):
 def read_table(path):
     """Lines of a table of any separator, as lists of words."""
     check(path.is_file(), f"the split file {path} is missing")
-    text = path.read_text("utf-8-sig", "replace")
+    text = path.read_text("utf-8-sig", "surrogateescape")
     lines = [line for line in text.splitlines() if line.strip()] or [""]
-    mark = max("\t;,", key=lines[0].count)
-    return [[word.strip(' "') for word in line.split(mark)] for line in lines]
+    separator = max("\t;,", key=lines[0].count)
+    return [[word.strip(' "') for word in line.split(separator)] for line in lines]
 
 
-def read_split(path):
-    """{name: whether it is held out} of a table with NeRF-W's columns, without the rows with an
-    empty id; or of train_list.txt and test_list.txt, one of which is `path`."""
-    head, *rows = read_table(path)
-    if path.suffix == ".txt":
-        head = ["filename", "split"]
-        rows = []
-        for part in ("train", "test"):
-            names = read_table(path.with_name(re.sub("train|test", part, path.name)))
-            rows += [(name, part) for name, *_ in names]
-    check({"filename", "split"} <= set(head), f"{path} needs a header with filename and split")
-    held_out = {}
-    for words in rows:
-        row = dict(zip(head, words))
-        name, part = row.get("filename"), row.get("split")
-        if row.get("id") == "":
-            continue
-        is_test = part == "test"
-        is_sound = name and part in ("train", "test") and held_out.get(name, is_test) == is_test
-        check(is_sound, f"{path}: {name!r} is {part!r}; each is train or test, and not both")
-        held_out[name] = is_test
-    return held_out
-
-
-def fingerprint(info):
-    """Of names, sizes and times of all files that a scene is read from."""
-    folder = Path(info["folder"])
-    paths = [*photo_files(Path(info["images"])).values(), *folder.glob("*.*")]
-    for path in below(folder, "images.bin"):
-        paths += path.parent.glob("*.bin")
-    if info["split"]:
-        paths.append(Path(info["split"]))
-    checksum = 0
-    for path in sorted(paths):
-        if path.exists():
-            line = f"{path} {path.stat().st_size} {path.stat().st_mtime_ns}\n"
-            checksum = zlib.crc32(os.fsencode(line), checksum)
-    return checksum
-
-
-def read_photo(path, camera, downscale):
-    """Unturned as COLMAP has it, undistorted, then reduced. -> rgb uint8 (h,w,3), K (4,)"""
-    (w, h), K, distortion = camera
-    check(1 <= downscale <= min(w, h) / 2, f"is {w} x {h}: choose another --downscale")
-    data = path.read_bytes()
-    # OpenCV says nothing where a file is cut off. A JPEG has an end mark after its last scan.
-    is_cut_jpeg = data[:2] == b"\xff\xd8" and data.rfind(b"\xff\xd9") < data.rfind(b"\xff\xda")
-    is_cut_png = data[1:4] == b"PNG" and b"IEND" not in data
-    check(not is_cut_jpeg and not is_cut_png, "is cut off: copy it again")
-    try:
-        image = cv2.imdecode(np.frombuffer(data, uint8),
-                             cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-    except cv2.error:   # empty, or more than a gigapixel
-        image = None
-    check(image is not None,
-          "is empty, damaged, too large or no photo of a known type: replace it")
-    size = image.shape[1::-1]
-    check(size == (w, h),
-          f"has {size[0]} x {size[1]} pixels, its camera {w} x {h}: put back what SfM saw")
-    if distortion.any():
-        places = [0, 1, 0, 1], [0, 1, 2, 2]   # of fx fy cx cy in a matrix
-        corner = 0, 0, 0.5, 0.5   # OpenCV's first pixel is at 0
-        M = eye(3)
-        M[places] = K - corner
-        P, _ = cv2.getOptimalNewCameraMatrix(M, distortion, (w, h), 0)   # shows nothing but photo
-        image = cv2.undistort(image, M, distortion, None, P)
-        K = P[places] + corner
-    small = w // downscale, h // downscale
-    image = cv2.resize(image, small, interpolation=cv2.INTER_AREA)
-    return image[..., ::-1], K * (small * 2) / (w, h, w, h)
-
-
-def choose_parts(folder, names, split):
-    """{name: whether it is held out} of the photos that are to be used, by the split file named or
-    found in the folder, which may be one of two lists; says by which rule."""
-    tables = sorted(folder.glob("[!.]*.[ct]sv"))
-    tables = [path for path in tables if "split" in read_table(path)[0]]
+def split_files(folder, split):
+    """The table of the split, or train_list.txt and test_list.txt: named or in the folder."""
+    tables = [
+        path for path in sorted(folder.glob("[!.]*.[ct]sv"))
+        if "split" in read_table(path)[0]
+    ]
     if not tables:
         tables = list(folder.glob("train*.txt"))
     if split:
         tables = [Path(split)]
-    check(len(tables) < 2, f"choose a split file by --split: {', '.join(map(str, tables))}")
+    check(len(tables) < 2,
+          f"choose a split file by --split: {', '.join(map(str, tables))}")
+    if tables and tables[0].suffix == ".txt":
+        name = tables[0].name
+        tables = [
+            tables[0].with_name(re.sub("train|test", part, name))
+            for part in ("train", "test")
+        ]
+    return tables
+
+
+def read_split(tables):
+    """{name: whether it is held out} of what split_files finds.
+
+    A table has NeRF-W's columns; rows with an empty id do not count.
+    """
+    path = tables[0]
+    if len(tables) == 2:
+        head = ["filename", "split"]
+        rows = [
+            (name, part)
+            for part, path in zip(("train", "test"), tables)
+            for name, *_ in read_table(path)
+        ]
+    else:
+        head, *rows = read_table(path)
+    check({"filename", "split"} <= set(head),
+          f"{path} needs a header with filename and split")
+    held_out = {}
+    for words in rows:
+        row = dict(zip(head, words))
+        if row.get("id") == "":
+            continue
+        name = row.get("filename")
+        part = row.get("split")
+        is_test = part == "test"
+        check(name and part in ("train", "test") and held_out.get(name, is_test) == is_test,
+              f"{path}: {name!r} is {part!r}; each is train or test, and not both")
+        held_out[name] = is_test
+    return held_out
+
+
+def choose_parts(folder, names, tables):
+    """{name: whether it is held out} of the photos that are to be used; tells the rule."""
     if not tables:
         print(f"{folder} has no split file: every eighth photo is held out")
         return {name: i % 8 == 7 for i, name in enumerate(names)}
-    held_out = read_split(tables[0])
     print(f"split by {tables[0]}")
+    held_out = read_split(tables)
+    matches = match_names(held_out, names)
+    held_out = {matches.get(name, name): part for name, part in held_out.items()}
     rest = set(names) - held_out.keys()
     if rest:
         warn(f"{len(rest)} photos are not in {tables[0]}: {min(rest)} ...")
     return held_out
 
 
-def read_usable(model, rows, held_out, downscale):
-    """{name: (rgb, K, c2w, rows of its points)} of the photos that can be used; says which cannot,
-    and why."""
+def checksum(paths, start=0):
+    """Of the content of those files that exist."""
+    for path in paths:
+        if path.is_file():
+            start = zlib.crc32(path.read_bytes(), start)
+    return start
+
+
+def photos_checksum(files, masks, start=0):
+    """Of the photos' names and content, and of their masks. files, masks: {name: path}"""
+    for name in sorted(files):
+        start = zlib.crc32(os.fsencode(name), start)
+        paths = [files[name]]
+        if name in masks:
+            paths.append(masks[name])
+        start = checksum(paths, start)
+    return start
+
+
+def fingerprint(info):
+    """Of the content of all files that a scene is read from, wherever they lie."""
+    folder = Path(info["folder"])
+    images = Path(info["images"])
+    models = [
+        sparse / name
+        for sparse in model_folders(folder)
+        for name in ("cameras.bin", "images.bin", "points3D.bin")
+    ]
+    there = photo_files(images)
+    files = {
+        name: there[other] for name, other in match_names(info["posed"], there).items()}
+    masks = mask_files(images, files)
+    start = checksum([*models, *split_files(folder, info["split"])])
+    return photos_checksum(files, masks, start)
+
+
+def is_heic(path):
+    """Also under another extension, as phones and mail send it."""
+    with open(path, "rb") as file:
+        head = file.read(12)
+    return head[4:8] == b"ftyp" and head[8:] in (b"heic", b"heix", b"mif1", b"msf1")
+
+
+def decode(data, flags):
+    """Image of OpenCV; None unless it is one."""
+    try:
+        return cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    except cv2.error:  # empty, or more than a gigapixel
+        return None
+
+
+def undistort(image, camera):
+    """An image (h,w) or (h,w,3) as a pinhole camera sees it, and its K (4,)."""
+    wh, K, distortion = camera
+    if not distortion.any():
+        return image, K
+    fx, fy, cx, cy = K - (0, 0, 0.5, 0.5)  # OpenCV's first pixel is at 0
+    M = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    P, _ = cv2.getOptimalNewCameraMatrix(M, distortion, wh, 0)  # 0: nothing but photo
+    image = cv2.undistort(image, M, distortion, None, P)
+    return image, np.array([P[0, 0], P[1, 1], P[0, 2] + 0.5, P[1, 2] + 0.5])
+
+
+def read_photo(path, camera, downscale):
+    """As COLMAP has it, undistorted, then reduced. -> rgb uint8 (h,w,3), K (4,)"""
+    w, h = camera[0]
+    check(1 <= downscale <= min(w, h) / 2, f"is {w} x {h}: choose another --downscale")
+    check(path.is_file(), "is a broken link: copy the photo itself")
+    check(not is_heic(path), "is HEIC, which cannot be read: convert it to JPEG")
+    data = path.read_bytes()
+    # OpenCV is silent where a file is cut off. A JPEG has an end mark after its last scan.
+    is_cut_jpeg = (
+        data[:2] == b"\xff\xd8" and data.rfind(b"\xff\xd9") < data.rfind(b"\xff\xda"))
+    is_cut_png = data[1:4] == b"PNG" and b"IEND" not in data
+    check(not is_cut_jpeg and not is_cut_png, "is cut off: copy it again")
+    image = decode(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    check(image is not None,
+          "is empty, damaged, too large or no photo of a known type: replace it")
+    stored = image.shape[1::-1]
+    if stored != (w, h):
+        image = decode(data, cv2.IMREAD_COLOR)
+    size = image.shape[1::-1]
+    tag = "" if size == stored else f", {size[0]} x {size[1]} by its EXIF orientation tag"
+    check(size == (w, h),
+          f"has {stored[0]} x {stored[1]} pixels{tag}, its camera {w} x {h}: put back what "
+          "SfM saw")
+    image, K = undistort(image, camera)
+    small = w // downscale, h // downscale
+    image = cv2.resize(image, small, interpolation=cv2.INTER_AREA)
+    return image[..., ::-1], K * (small * 2) / (w, h, w, h)
+
+
+def read_mask(path, size):
+    """A mask in its photo's size (w, h). -> uint8 (h,w): 0 is left out, 255 is not"""
+    mask = decode(path.read_bytes(), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+    check(mask is not None, "is no image")
+    mask = np.where(mask < 128, 0, 255).astype(np.uint8)
+    h, w = mask.shape
+    check(abs(w * size[1] / (h * size[0]) - 1) < 0.02,
+          f"has {w} x {h} pixels, its photo {size[0]} x {size[1]}")
+    check(mask.any(), "is black all over; 255 is white")
+    return cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST)
+
+
+def read_masks(model, usable):
+    """Of each usable photo, which pixels are left out: a list of (h,w) bool, or None."""
+    paths = mask_files(model.images, usable)
+    masks = []
+    used = 0
+    for name, (image, *_) in usable.items():
+        h, w = image.shape[:2]
+        masked = np.zeros((h, w), bool)
+        if name in paths:
+            camera = model.photos[name][0]
+            try:
+                mask, _ = undistort(read_mask(paths[name], camera[0]), camera)
+                mask = cv2.resize(mask, (w, h), interpolation=cv2.INTER_AREA)
+                masked = mask < 128
+                used += 1
+            except UserError as e:
+                warn(f"mask not used: {paths[name]} {e}")
+        masks.append(masked)
+    if not used:
+        return None
+    black = np.mean(np.concatenate([masked.ravel() for masked in masks]))
+    print(f"{used} of {len(masks)} photos have a mask: {black:.0%} of all pixels are black "
+          "and left out")
+    return masks
+
+
+def read_usable(model, points, rows, held_out, downscale):
+    """{name: (rgb, K, c2w, rows of its points)} of the photos that can be used.
+
+    Tells which cannot, and why.
+    """
     usable = {}
+    misfits = {}  # photos that miss most of the points that they should see
     for name in progress(sorted(held_out), "preparing photos"):
         try:
-            if name not in model.names:
-                same = [other for other in model.names if Path(other).stem == Path(name).stem]
-                raise UserError(f"has no pose or no file; of other folder or extension: {same}")
+            check(name in model.photos, f"has no pose{nearest(name, model.files)}")
+            check(name in model.files, f"is not on disk{nearest(name, model.on_disk)}")
             camera, pose, ids = model.photos[name]
             check_photo(camera, pose, held_out[name])
             image, K = read_photo(model.files[name], camera, downscale)
-            own = [rows[key] for key in ids if key in rows]
-            usable[name] = image, K, camera_to_world(pose), array(own, int)
         except UserError as e:
             warn(f"left out: {name} {e}")
+            continue
+        c2w = camera_to_world(pose)
+        own = np.array([rows[key] for key in ids if key in rows], int)
+        uv, _ = project(K, c2w, points[own, :3])
+        is_inside = ((uv >= 0) & (uv < image.shape[1::-1])).all(1)
+        if len(own) and is_inside.mean() < 0.5:
+            misfits[name] = is_inside.mean()
+        usable[name] = image, K, c2w, own
+    check(2 * len(misfits) <= len(usable),
+          f"{len(misfits)} of {len(usable)} photos miss most of their points: give poses as "
+          "COLMAP does, world to camera, x right, y down, z forward, in the units of the points")
+    for name, share in misfits.items():
+        warn(f"left out: {name} shows {share:.0%} of its points: its pose or its distortion "
+             "is wrong")
+        del usable[name]
     lost = [name for name in held_out if held_out[name] and name not in usable]
-    check(not lost, f"held-out photos cannot be used, mend them or hold out others: {lost}")
+    check(not lost,
+          f"held-out photos cannot be used, mend them or hold out others: {lost}")
     count = sum(not held_out[name] for name in usable)
-    check(count >= 2, f"{count} usable training photos are too few: mend them or the split file")
+    check(count >= 2,
+          f"{count} usable training photos are too few: mend them or the split file")
     return usable
 
 
@@ -976,25 +1337,30 @@ def prepare(name, downscale=2, split=None):
             folder = DATA / SCENES[name][0]
     model = find_model(folder, command)
     split = os.path.abspath(split) if split else None
-    info = dict(scene=folder.resolve().name, kind="colmap", downscale=downscale,
-                folder=str(folder), images=str(model.images), split=split)
+    info = dict(
+        scene=folder.resolve().name,
+        kind="colmap",
+        downscale=downscale,
+        folder=str(folder),
+        images=str(model.images),
+        posed=sorted(model.photos),
+        split=split)
     info["files"] = fingerprint(info)
-    held_out = choose_parts(folder, model.names, split)
+    tables = split_files(folder, split)
+    held_out = choose_parts(folder, sorted(model.files), tables)
     points, rows = read_points(model.sparse)
-    usable = read_usable(model, rows, held_out, downscale)
+    usable = read_usable(model, points, rows, held_out, downscale)
+    masks = read_masks(model, usable)
     images, K, c2w, tracks = zip(*usable.values())
     is_test = [held_out[name] for name in usable]
-    scene = finish(images, K, c2w, is_test, list(usable), points, tracks, info)
-    uv = scene["track_uv"]
-    share = (abs(uv - .5) <= .5).all(1).mean()
-    says = f"only {share:.0%} of all sightings of points fall into the photo that saw them"
-    photo = scene["track_photo"]
-    spread = median([std(uv[photo == i], axis=0).max() for i in np.unique(photo)])
-    is_sound = share >= .5 and spread > .02   # points in smaller units lie close together
-    check(is_sound, f"{says}: give poses as COLMAP does, world to camera, x right, y down, "
-          "z forward, in the units of the points")
-    if share < .9:
-        warn(says)
+    scene = build_scene(
+        images, K, c2w, is_test, list(usable), points, tracks, info, masks=masks)
+    spread = [
+        np.std(scene["track_uv"][scene["track_photo"] == i], axis=0).max()
+        for i in np.unique(scene["track_photo"])
+    ]
+    check(np.median(spread) > 0.02,
+          "the points of a photo lie on one spot of it: give poses in the units of the points")
     inside = (lengths(scene["points"]) < 1).mean()
     print(f"the sphere has a radius of {scene['scale']:.3g} units of the reconstruction; "
           f"{inside:.0%} of the points are inside")
@@ -1011,61 +1377,69 @@ def scene_path(name_or_folder):
 
 
 def open_scene(name_or_folder, downscale=2):
-    """Scene from its file: made on first use, and anew if its sources differ in any way."""
+    """Scene from its file: made on first use, and anew if the content of a source differs."""
     path = scene_path(name_or_folder)
     split = None
     if path.exists():
         scene = read_scene(path)
         info = json.loads(str(scene["info"]))
-        split = info["split"]   # named once, by --split
+        split = info["split"]  # named once, by --split
         if info["kind"] == "toy" or (info["downscale"] == downscale and is_fresh(info)):
             return scene
     print(f"making {path}")
-    scene = make_toy() if name_or_folder == "toy" else prepare(name_or_folder, downscale, split)
+    if name_or_folder == "toy":
+        scene = make_toy()
+    else:
+        scene = prepare(name_or_folder, downscale, split)
     write_scene(path, scene)
     return scene
 
 
 def is_fresh(info):
-    """Whether a scene's sources are as they were, or gone: a scene file does without them."""
-    return not Path(info["folder"]).is_dir() or info.get("files") == fingerprint(info)
+    """Whether a scene's sources are as they were, or gone: a scene file does without."""
+    if not Path(info["folder"]).is_dir():
+        return True
+    return "posed" in info and info["files"] == fingerprint(info)
 
 
-# ---- download, SfM, command line -----------------------------------------------------------------
+# ---- download, SfM, command line -------------------------------------------------------
 def fetch(folder_url, path):
-    """Streams the file of path's name into path, unless that exists; what came of a broken transfer
-    waits in path.part to be continued."""
+    """Streams the file of path's name into path, unless that exists.
+
+    The part that came of a broken transfer waits in path.part to be continued.
+    """
     if path.exists():
         return
     url = folder_url + path.name
     part = path.with_name(path.name + ".part")
     try:
         path.parent.mkdir(exist_ok=True)
-        with open(part, "ab") as file:   # the last byte again: so a whole part is no special case
-            have = max(file.tell() - 1, 0)
+        with open(part, "ab") as file:
+            have = max(file.tell() - 1, 0)  # the last byte again: also of a whole part
             request = Request(url, headers={"Range": f"bytes={have}-"})
             with urlopen(request, timeout=60) as answer:
                 if answer.status != 206:
-                    have = 0   # a server without ranges starts over
+                    have = 0  # a server without ranges starts over
                 total = have + int(answer.headers["Content-Length"])
                 file.truncate(have)
                 for _ in progress(range(have, total, 1 << 20), f"MiB of {path.name}"):
                     have += file.write(answer.read(1 << 20))
         check(have == total, "it ended early")
         part.replace(path)
-    except Exception as e:   # of the disk, the network or its protocol
-        if getattr(e, "code", 0) == 416:   # longer than the file itself
+    except Exception as e:  # of the disk, the network or its protocol
+        if getattr(e, "code", 0) == 416:  # longer than the file itself
             part.unlink()
-        raise UserError(f"the download of {url} broke ({e}); the same command continues it") from e
+        says = f"the download of {url} broke ({e}); the same command continues it"
+        raise UserError(says) from e
 
 
 def unpack(archive, wanted, folder):
     """Files of a .tar.gz whose names start so; the whole archive is checked."""
     with gzip.open(archive) as raw, tarfile.open(fileobj=raw, mode="r|") as tar:
-        for member in tar:   # files only: a link could lead outside
+        for member in tar:  # files only: a link could lead outside
             if member.isfile() and member.name.startswith(wanted):
                 tar.extract(member, folder, filter="data")
-        while raw.read(1 << 20):   # to the checksum at the very end
+        while raw.read(1 << 20):  # to the checksum at the very end
             pass
 
 
@@ -1085,32 +1459,93 @@ def download(name):
             place = Path(temporary) / scene
             shutil.copy(table, place / table.name)
             place.replace(home)
-    except Exception as e:   # a damaged archive can fail in any layer
-        raise UserError(f"cannot unpack {archive} ({e}): free space, or delete it and retry") from e
+    except Exception as e:  # a damaged archive can fail in any layer
+        says = f"cannot unpack {archive} ({e}): free space, or delete it and retry"
+        raise UserError(says) from e
+
+
+def sfm_photos(images):
+    """{name: path} of raw photos, all of which pycolmap can read."""
+    files = photo_files(images)
+    for name in [name for name, path in files.items() if not path.is_file()]:
+        warn(f"left out: {name} is a broken link")
+        del files[name]
+    check(files, f"{images} has no photos: name the folder that holds them")
+    heic = [name for name, path in files.items() if is_heic(path)]
+    check(not heic,
+          f"{len(heic)} photos are HEIC, such as {heic[:1]}, which cannot be read: convert "
+          "them to JPEG")
+    for name in files:
+        is_text = os.fsencode(name).decode(errors="replace") == name
+        check(is_text, f"the name {name!a} is not UTF-8: rename the photo")
+    return files
+
+
+def write_sfm_masks(files, masks, folder):
+    """Masks in the photos' sizes under COLMAP's names, photo.jpg.png."""
+    for name, path in masks.items():
+        photo = decode(
+            files[name].read_bytes(), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+        check(photo is not None, f"{files[name]} is damaged: replace it")
+        try:
+            mask = read_mask(path, photo.shape[1::-1])
+        except UserError as e:
+            warn(f"mask not used: {path} {e}")
+            continue
+        target = folder / f"{name}.png"
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.write_bytes(cv2.imencode(".png", mask)[1].tobytes())
+
+
+def import_pycolmap():
+    install = 'run pip install "pycolmap>=3.13"'
+    try:
+        import pycolmap  # an extra
+    except ImportError as e:
+        raise UserError(f"--sfm needs pycolmap ({e}): {install}") from e
+    check(hasattr(pycolmap, "FeatureExtractionOptions"),
+          f"pycolmap {pycolmap.__version__} is too old: {install}")
+    return pycolmap
 
 
 def run_sfm(folder):
-    """Poses for the raw photos in `folder`, by pycolmap -> folder/dense/{images,sparse}"""
-    import pycolmap   # an extra: main says when it is not there
-    database = folder / "database.db"
-    models = folder / "models"
-    dense = folder / "dense"
-    photos = next(folder.glob("images"), folder)   # beside it lie smaller copies and masks
-    check(folder.is_dir() and not dense.exists(),
-          f"{folder} is missing, or has dense/: delete that")
-    models.mkdir(exist_ok=True)
-    # Of 135 photos of a statue in all lights these options pose 104 in one model instead of 60.
+    """Poses for the raw photos in `folder`, by pycolmap -> folder/sparse/{0,1,...}
+
+    The database waits in data/ for a second try and goes after a success.
+    """
+    images = folder / "images"
+    if not images.is_dir():
+        images = folder
+    sparse = folder / "sparse"
+    check(not sparse.exists() and not (folder / "dense").exists(),
+          f"{folder} has sparse/ or dense/, a model: leave --sfm out, or delete that")
+    files = sfm_photos(images)
+    masks = mask_files(images, files)
+    pycolmap = import_pycolmap()
+    work = DATA / f"sfm-{photos_checksum(files, masks):08x}"
+    work.mkdir(parents=True, exist_ok=True)
+    database = work / "database.db"
+    reader = pycolmap.ImageReaderOptions()
+    if masks:
+        write_sfm_masks(files, masks, work / "masks")
+        reader.mask_path = work / "masks"
+    # Of 135 photos of a statue in all lights these options pose 104 in one model, not 60.
     features = pycolmap.FeatureExtractionOptions()
     features.sift.estimate_affine_shape = True
     features.sift.domain_size_pooling = True
     matching = pycolmap.FeatureMatchingOptions()
     matching.guided_matching = True
-    pycolmap.extract_features(database, photos, extraction_options=features)
+    pycolmap.extract_features(
+        database, images, sorted(files), reader_options=reader, extraction_options=features)
     pycolmap.match_exhaustive(database, matching_options=matching)
-    found = pycolmap.incremental_mapping(database, photos, models)
-    check(found, f"the photos in {folder} do not match each other; take more, with more overlap")
-    best = max(found, key=lambda i: found[i].num_reg_images())
-    pycolmap.undistort_images(dense, models / str(best), photos)
+    with tempfile.TemporaryDirectory(prefix=".sparse", dir=folder) as temporary:
+        models = Path(temporary, "models")
+        models.mkdir()
+        found = pycolmap.incremental_mapping(database, images, models)
+        check(found,
+              f"the photos in {folder} do not match each other; take more, with more overlap")
+        models.rename(sparse)
+    shutil.rmtree(work)
 
 
 def main(argv=None):
@@ -1122,13 +1557,15 @@ def main(argv=None):
     add("--download", action="store_true", help="fetch archive and split file first")
     add("--sfm", action="store_true", help="the folder has raw photos: pose them first")
     add("--downscale", type=int, help="photos get this many times smaller; default 2")
-    add("--split", help="default: a .tsv, .csv or train_list.txt in the folder, or every 8th photo")
+    add("--split", help="default: a .tsv, .csv or train_list.txt in it, or every 8th photo")
     knobs = inspect.signature(make_toy).parameters
     for key, knob in knobs.items():
         how = {"type": type(knob.default)}
         if isinstance(knob.default, bool):
             how = {"action": argparse.BooleanOptionalAction}
         add(f"--{key}", help=f"toy, default {knob.default}", **how)
+    allow_any_character()
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C
     given = vars(parser.parse_args(argv))
     name = given.pop("scene")
     is_download = given.pop("download", False)
@@ -1144,7 +1581,7 @@ def main(argv=None):
             run_sfm(Path(name))
         scene = make_toy(**given) if name == "toy" else prepare(name, **given)
         write_scene(path, scene)
-    except (UserError, OSError, MemoryError, ImportError, KeyboardInterrupt) as e:
+    except (UserError, OSError, MemoryError, KeyboardInterrupt) as e:
         warn(f"error: {str(e) or 'stopped; start again'}")
         sys.exit(2)
     print(f"{path}: {len(scene['wh'])} photos, {scene['is_test'].sum()} of them for testing")
