@@ -424,11 +424,14 @@ def trace(o, d, parts):
     return enter.min(0), enter.argmin(0)
 
 
-def sky(d):
-    """Linear colour of the sky and two ranges of hills. d (R,3) -> (R,3)"""
+def sky_colour(d, weather):
+    """Linear colour of the sky and two ranges of hills. d (R,3), weather (4,) -> (R,3)"""
     up = d[:, 2:]
     azimuth = np.arctan2(d[:, :1], d[:, 1:2])
+    *tint, wind = weather
+    cloud = np.sin(5 * azimuth + 9 * wind) * np.sin(12 * up + 7 * wind)
     colour = (0.58, 0.68, 0.78) - np.clip(up * 1.5, 0, 1) * (0.52, 0.46, 0.26)
+    colour = colour + 0.4 * np.array(tint) + 0.5 * abs(wind) * np.maximum(cloud, 0)
     for slope, swing, waves, hill in [
         (0.11, 0.045, 5, (0.25, 0.33, 0.45)),
         (0.06, 0.03, 9, (0.11, 0.18, 0.16)),
@@ -468,12 +471,12 @@ def paint(part, x):
     return texture(part.material, turn, z)
 
 
-def shade(o, d, parts, background, sun):
+def shade(o, d, parts, background, sun, weather):
     """Linear colours along rays: sun, shadow, light of the sky, haze.
 
-    o (1,3), d (R,3), sun (3,) -> (R,3)
+    o (1,3), d (R,3), sun (3,), weather (4,) -> (R,3)
     """
-    colour = sky(d) * background
+    colour = sky_colour(d, weather) * background
     t, which = trace(o, d, parts)
     hit = np.flatnonzero(t < np.inf)
     t = t[hit, None]
@@ -613,7 +616,7 @@ def shake_camera(rng, K, c2w, pixels):
 
 
 def make_toy(seed=0, size=96, photos=48, test=8, occluders=0.05, exposure=1.0,
-             pose_noise=0.0, background=True, landmark=0, sun=0.0):
+             pose_noise=0.0, background=True, landmark=0, sun=0.0, sky=0.0):
     """Scene of a procedural landmark, the same for every seed.
 
     size: long side of a photo [px]
@@ -623,17 +626,18 @@ def make_toy(seed=0, size=96, photos=48, test=8, occluders=0.05, exposure=1.0,
     background: False leaves nothing but the landmark, before black
     landmark: another building for every number
     sun: its azimuth differs from photo to photo by up to so many degrees
+    sky: how much its colour and clouds differ from photo to photo, 0 to 1
     """
     info = dict(
         locals(), scene="toy", kind="toy", downscale=1, folder=None, split=None)
     is_sound = occluders <= 0.6 and exposure <= 2 and sun <= 180 and pose_noise < np.inf
-    is_sound &= min(seed, test, occluders, exposure, pose_noise, landmark, sun) >= 0
-    check(is_sound and size >= 16 and photos >= 4,
-          "occluders in 0..0.6, exposure 0..2, sun 0..180, size >= 16, photos >= 4, "
-          "others >= 0")
+    is_sound &= min(seed, test, occluders, exposure, pose_noise, landmark, sun, sky) >= 0
+    check(is_sound and sky <= 1 and size >= 16 and photos >= 4,
+          "occluders in 0..0.6, exposure 0..2, sun 0..180, sky 0..1, size >= 16, "
+          "photos >= 4, others >= 0")
     # No knob changes another's random numbers.
-    generators = [np.random.default_rng([seed, k]) for k in range(6)]
-    camera, taste, people, sfm, shake, day = generators
+    generators = [np.random.default_rng([seed, k]) for k in range(7)]
+    camera, taste, people, sfm, shake, day, air = generators
     count = photos + test
     numbers = np.arange(count)
     angles = 200 * (numbers + camera.uniform(0.1, 0.9, count)) / count - 100
@@ -643,6 +647,7 @@ def make_toy(seed=0, size=96, photos=48, test=8, occluders=0.05, exposure=1.0,
     share = share * ~is_test
     share = np.minimum(share / share.sum() * photos * occluders, 0.85)
     turns = np.radians(day.uniform(-sun, sun, count))
+    weather = air.uniform(-sky, sky, (count, 4))
     parts = toy_parts(landmark, background)
     depth, surface, images, occluder = [], [], [], []  # of each photo
     for i in progress(numbers, "drawing photos"):
@@ -652,7 +657,7 @@ def make_toy(seed=0, size=96, photos=48, test=8, occluders=0.05, exposure=1.0,
         linear = 0
         for offset in itertools.product((0.25, 0.75), repeat=2):  # places in a pixel
             d = ray_directions(*views[i], offset)
-            colour = shade(o, d, parts, background, to_sun)
+            colour = shade(o, d, parts, background, to_sun, weather[i])
             linear = linear + np.clip(colour, 0, 1) / 4
         cover = draw_people(people, w, h, share[i])
         linear = linear * (1 - cover[:, 3:]) + cover[:, :3]  # (h*w,3)

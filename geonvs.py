@@ -209,6 +209,15 @@ def load_scene(raw, device="cpu"):
     return Scene(*tensors, raw, json.loads(str(raw["info"])))
 
 
+def open_scene(cfg, device):
+    """The scene that settings name; its file is made on first use."""
+    is_there = not cfg.data or Path(cfg.data).is_dir()
+    check(is_there or data_prep.scene_path(cfg.source).exists(),
+          f"{cfg.data} does not exist: give the folder's place by --data; a run that was trained "
+          "with its old place also needs --name")
+    return load_scene(data_prep.open_scene(cfg.source, cfg.downscale), device)
+
+
 class Rays(NamedTuple):
     """A batch of rays; every field is indexed by the ray."""
     o: Tensor  # (R,3) origin
@@ -1331,7 +1340,7 @@ def load_run(run, **given):
     run = Path(run)
     saved, cfg = read_checkpoint(run / "checkpoint.pt", given)
     device = pick_device(cfg.device)
-    scene = load_scene(data_prep.open_scene(cfg.source, cfg.downscale), device)
+    scene = open_scene(cfg, device)
     with device:
         model = GeoNVS(cfg, scene)
     restore(saved, model)
@@ -1908,9 +1917,9 @@ def main(argv=None):
     if RANKS > 1:
         start_processes(device)
         if RANK == 0:
-            data_prep.open_scene(cfg.source, cfg.downscale)  # the others find it made
+            open_scene(cfg, "cpu")  # the others find it made
         dist.barrier()
-    scene = load_scene(data_prep.open_scene(cfg.source, cfg.downscale), device)
+    scene = open_scene(cfg, device)
     with locked(run) if RANK == 0 else contextlib.nullcontext():
         if resume:
             saved, cfg = read_checkpoint(run / "checkpoint.pt", given)
@@ -1927,8 +1936,7 @@ def run_command_line(entry):
     """Exit code 0, or 2 with one sentence on stderr; a bug keeps its traceback."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.default_int_handler)
-    for stream in (sys.stdout, sys.stderr):  # a terminal may lack a character of a file's name
-        stream.reconfigure(errors="backslashreplace")
+    data_prep.allow_any_character()
     try:
         entry()
         return
