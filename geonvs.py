@@ -1092,6 +1092,10 @@ class GeoNVS(nn.Module):
             is_soft = done < ZETA_RISE  # then the surface moves far
             self.cache.refresh(self.distance, None if is_soft else step // CACHE_EVERY)
 
+    def after_training(self):
+        """Pictures follow the last weights."""
+        self.cache.refresh(self.distance)
+
     def update_statistics(self, rays, out):
         """Remembers what refinement and the mask's threshold depend on."""
         self.mask.update_quantiles(rays, out, out["error"])
@@ -1402,7 +1406,7 @@ def train(cfg, scene, run, saved=None):
             if before < MASK_TRAINING <= done:
                 model.decide_mask()
             if done >= 1:
-                model.cache.refresh(model.distance)  # pictures follow the last weights
+                model.after_training()
             is_last = done >= 1 or is_stopped
             if RANK == 0 and (is_last or state.seconds >= next_log):
                 next_log = state.seconds + PAUSE
