@@ -209,13 +209,13 @@ def load_scene(raw, device="cpu"):
     return Scene(*tensors, raw, json.loads(str(raw["info"])))
 
 
-def open_scene(cfg, device):
-    """The scene that settings name; its file is made on first use."""
+def read_scene(cfg):
+    """The dictionary of the scene file that settings name; the file is made on first use."""
     is_there = not cfg.data or Path(cfg.data).is_dir()
     check(is_there or data_prep.scene_path(cfg.source).exists(),
           f"{cfg.data} does not exist: give the folder's place by --data; a run that was trained "
           "with its old place also needs --name")
-    return load_scene(data_prep.open_scene(cfg.source, cfg.downscale), device)
+    return data_prep.open_scene(cfg.source, cfg.downscale)
 
 
 class Rays(NamedTuple):
@@ -345,7 +345,7 @@ class Octree(nn.Module):
         resolution = root * 2.0 ** torch.arange(levels)
         self.resolution = nn.Buffer(resolution, persistent=False)  # (L,) cells along an axis
         self.features = torch.zeros(0, channels)  # (V,C), none at first; build adds parameters
-        self.corner_key = torch.arange(0)  # (V,) sorted, the corner of each row
+        self.corner_key = nn.Buffer(torch.arange(0), persistent=False)
         self.build(self.corner_key)  # no cell is split
 
     @property
@@ -384,8 +384,8 @@ class Octree(nn.Module):
         key = key[has_feature]  # (V,)
         is_old = torch.isin(key, self.corner_key)
 
-        self.split_keys = split_keys
-        self.corner_key = key
+        self.split_keys = nn.Buffer(split_keys, persistent=False)
+        self.corner_key = nn.Buffer(key, persistent=False)  # (V,) sorted, the corner of each row
         self.features = nn.Parameter(carry_over_rows(self.features, is_old))
         self.cells = nn.Buffer(cells, persistent=False)
         self.child = nn.Buffer((first_child * is_split).int(), persistent=False)  # (N,) 0: none
@@ -507,17 +507,17 @@ def colors_of(network, geo, per_ray):
     return mixed_precision(network, inputs).sigmoid()
 
 
-TETRAHEDRON = torch.tensor([  # a point and, at a distance of 1, the corners around it
-    [0.0, 0.0, 0.0],
-    [1.0, 1.0, 1.0],
-    [1.0, -1.0, -1.0],
-    [-1.0, 1.0, -1.0],
-    [-1.0, -1.0, 1.0]]) / 3**0.5  # (5,3)
+TETRAHEDRON = (  # its centre and its corners, at a distance of 3^0.5
+    (0.0, 0.0, 0.0),
+    (1.0, 1.0, 1.0),
+    (1.0, -1.0, -1.0),
+    (-1.0, 1.0, -1.0),
+    (-1.0, -1.0, 1.0))
 
 
 def finite_differences(s, taps, eps):
-    """Gradient (P,3) and Laplacian (P,) of a field from its values s (P,5) at x + eps taps, taps
-    being TETRAHEDRON (Neuralangelo's code; its paper has six)."""
+    """Gradient (P,3) and Laplacian (P,) of a field from its values s (P,5) at x + eps taps: x
+    itself, then the corners of a tetrahedron (Neuralangelo's code; its paper has six)."""
     grad = 3 / (4 * eps) * (s @ taps)  # (P,3) as the sum of k k^T over corners k is 4/3 I
     lap = 6 / eps**2 * (s[:, 1:].mean(1) - s[:, 0])
     return grad, lap
@@ -539,7 +539,8 @@ class SDFField(nn.Module):
         last = self.network[2]
         nn.init.normal_(last.weight[0], std=0.01)
         nn.init.zeros_(last.bias)
-        self.taps = nn.Buffer(TETRAHEDRON.to(last.bias.device), persistent=False)
+        taps = torch.tensor(TETRAHEDRON) / 3**0.5  # (5,3), of length 1
+        self.taps = nn.Buffer(taps, persistent=False)
 
     def forward(self, x):
         """sdf (...) and geometry (...,G) at x (...,3)."""
@@ -660,13 +661,15 @@ class SDFCache(nn.Module):
         """E_grad and E_curv (R,) of rays with samples x (R,N,3): ray-wise averages. Eq. 4"""
         return self.lookup(x, slice(1, 3)).mean(2)
 
-    def sample(self, rays, t0, t1, jitter, zeta):
+    @torch.no_grad()
+    def sample(self, rays, t0, t1, jitter, alpha):
         """Distances (R,S+1) from t0 to t1 (R,1), dense where a surface is seen. jitter: (R,S-1) in
-        0..1, of the stratified samples between the ends."""
+        0..1, of the stratified samples between the ends; alpha: GeoNVS.alpha."""
         share = torch.linspace(0, 1, PROBES + 1, device=t0.device)
         probes = t0.lerp(t1, share)  # (R,N+1)
-        zeta = zeta.detach().clamp_max(self.n)  # surfaces at least half a voxel wide
-        weight = composite(neus_alpha(self.sdf(rays.at(probes)), zeta))  # (R,N)
+        sdf = self.sdf(rays.at(probes))  # (R,N+1)
+        alphas = alpha(sdf, probes, max_zeta=self.n)  # (R,N) surfaces at least half a voxel wide
+        weight = composite(alphas)
         uniform_weight = UNIFORM_SHARE * weight.mean(1, keepdim=True)
         inner = inverse_cdf(probes, weight + uniform_weight + 1e-5, stratified(jitter))
         return torch.cat([t0, inner, t1], 1)
@@ -742,12 +745,11 @@ def render_rays(model, rays, code, random, points):
     points; e_grad (R+N,) at surface points and points; sdf (N,) at points; ray_e_grad and
     ray_e_curv (R,), averages along the ray. Depth and places have no gradient."""
     fg_random, bg_random = random.tensor_split([model.cfg.samples - 1], 1)
-    zeta = model.zeta()
     t0, t1 = sphere_interval(rays)  # (R,1)
-    t = model.cache.sample(rays, t0, t1, fg_random, zeta)  # (R,S+1)
+    t = model.cache.sample(rays, t0, t1, fg_random, model.alpha)  # (R,S+1)
     x = rays.at(t)  # (R,S+1,3)
     sdf, geo = model.sdf(x)  # (R,S+1), (R,S+1,G)
-    w = composite(neus_alpha(sdf, zeta))  # (R,S)
+    w = composite(model.alpha(sdf, t))  # (R,S)
     opacity = w.sum(1)  # (R,)
     w = F.pad(w, (1, 1))
     w = 0.5 * (w[:, :-1] + w[:, 1:])  # (R,S+1) an interval has the mean colour of its ends [D1]
@@ -930,9 +932,10 @@ class TransientMask(nn.Module):
             out["complexity"].repeat(3),
             out["is_solid"].repeat(3))
         of_one = torch.zeros_like(rays.img)
-        update_running_quantiles(self.sfm_error, 0.75, of_one, error, rays.is_static)
+        is_used = ~rays.is_masked
+        update_running_quantiles(self.sfm_error, 0.75, of_one, error, rays.is_static & is_used)
         cell = place_cell(out["place"])
-        update_running_quantiles(self.place_error, PLACE_QUANTILE, cell, error, ~rays.is_masked)
+        update_running_quantiles(self.place_error, PLACE_QUANTILE, cell, error, is_used)
 
 
 # ---- 7 The model and its objective ---------------------------------------------------------------
@@ -1028,6 +1031,11 @@ class GeoNVS(nn.Module):
         """The deviation network: one learned number; 1 / zeta is the width of a surface."""
         return torch.exp(10 * self.deviation)
 
+    def alpha(self, sdf, t, max_zeta=math.inf):
+        """Opacity (R,S) of the intervals between samples at t (R,S+1) with SDF (R,S+1). A density
+        would need t."""
+        return neus_alpha(sdf, self.zeta().clamp_max(max_zeta))
+
     def distance(self, x):
         """s (P,) at x (P,3)."""
         return self.sdf(x)[0]
@@ -1059,7 +1067,7 @@ class GeoNVS(nn.Module):
             # SfM pixels count as if they had no error: they train M = 0 [D7]
             excess = error * ~rays.is_static - self.mask.threshold(out["place"], cfg.mask_margin)
             reg = mask_loss(logit, excess * ~rays.is_masked)
-            gpl = gpl_loss(M, phi)
+            gpl = gpl_loss(M, phi * ~rays.is_masked)
             mask = reject_outliers(M.detach(), excess > 0, done)
         mask = mask.masked_fill(rays.is_masked, 1)
 
@@ -1344,7 +1352,7 @@ def load_run(run, **given):
     run = Path(run)
     saved, cfg = read_checkpoint(run / "checkpoint.pt", given)
     device = pick_device(cfg.device)
-    scene = open_scene(cfg, device)
+    scene = load_scene(read_scene(cfg), device)
     with device:
         model = GeoNVS(cfg, scene)
     restore(saved, model)
@@ -1572,15 +1580,14 @@ def mask_mean(mask, chosen):
 
 
 def depth_edges(depth):
-    """Whether depth (H,W) jumps by 5 % or more between a pixel and one of its four neighbours."""
-    log_depth = np.log(depth.astype(np.float32).clip(max=1e4))  # inf is sky
+    """Whether a pixel of depth (H,W) lies beside a jump: there inverse depth, which is linear on a
+    plane, bends by 5 % or more between the pixel's neighbours."""
+    inverse = 1 / depth.astype(np.float32)  # 0: sky
     edges = np.zeros(depth.shape, bool)
-    jump = np.abs(np.diff(log_depth, axis=0)) > math.log(1.05)
-    edges[1:] |= jump
-    edges[:-1] |= jump
-    jump = np.abs(np.diff(log_depth, axis=1)) > math.log(1.05)
-    edges[:, 1:] |= jump
-    edges[:, :-1] |= jump
+    for q, is_edge in (inverse, edges), (inverse.T, edges.T):  # down, then across
+        before, here, after = q[:-2], q[1:-1], q[2:]
+        bend = np.abs(2 * here - before - after)
+        is_edge[1:-1] |= bend > 0.05 * np.maximum(here, np.maximum(before, after))
     return edges
 
 
@@ -1921,9 +1928,9 @@ def main(argv=None):
     if RANKS > 1:
         start_processes(device)
         if RANK == 0:
-            open_scene(cfg, "cpu")  # the others find it made
+            read_scene(cfg)  # the others find it made
         dist.barrier()
-    scene = open_scene(cfg, device)
+    scene = load_scene(read_scene(cfg), device)
     with locked(run) if RANK == 0 else contextlib.nullcontext():
         if resume:
             saved, cfg = read_checkpoint(run / "checkpoint.pt", given)
