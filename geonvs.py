@@ -11,9 +11,11 @@ follow one ray from its pixel to the loss; the training loop comes after them.
     python geonvs.py --help                every setting with its meaning and default
 
 The paper's equations
-  Eq. 1  opacity of an interval     neus_alpha        Eq. 4  edge indicator Phi   edge_indicator
-  Eq. 2  compositing weights        composite         Eq. 5  objective            objective
+  Eq. 1  opacity of an interval     neus_alpha
+  Eq. 2  compositing weights        composite
   Eq. 3  geometry preservation      gpl_loss
+  Eq. 4  edge indicator Phi         edge_indicator, complexity, SDFCache.errors
+  Eq. 5  objective                  objective
 
 Conventions
   world     the foreground is the unit sphere; x * scale + center leads back to SfM units
@@ -22,14 +24,16 @@ Conventions
   sdf       positive outside; the normal is the unit gradient; colours are sRGB in [0, 1]
   mask      M = 1 means transient (person, car), M = 0 means static scene
   symbols   s signed distance; zeta sharpness of the surface (1 / zeta is its width); eps step of
-            finite differences; lap Laplacian; E_grad = (|grad s| - 1)^2; E_curv = |lap s|
+            finite differences; lap Laplacian; E_grad = (|grad s| - 1)^2; E_curv = |lap s| [D2]
   shapes    R rays, S intervals of a ray (S + 1 samples), P points, N as the line says, L octree
             levels, C channels per level, V feature rows, G inputs of the colour network from
-            geometry, A appearance dims, B photos of all I, K SfM points, T their sightings
+            geometry, A appearance dims, I photos in all, B of them in a batch, K SfM points, T
+            their sightings
 
-Departures from the printed paper; the tag stands at the code, with the reason
+Departures from the printed paper; the tag stands at the code
   [D1]  Eq. 1 is divided by sigmoid(zeta s_i), and s is evaluated at both ends: no beta
-  [D2]  E_curv is |lap s| eps; the sigmoid of Eq. 4 is calibrated by running quantiles
+  [D2]  E_curv is |lap s| times the step of the differences (eps in L_curv, a voxel in Phi): at a
+        crease lap s grows as the step shrinks; Phi's sigmoid is calibrated by running quantiles
   [D3]  L_reg classifies pixels as transient by a threshold on their error; outliers are rejected
   [D4]  L_lps is a sum of logarithms, not a product
   [D5]  CGNet is reduced to three stages and reads small square photos
@@ -176,11 +180,11 @@ class Scene(NamedTuple):
     c2w: Tensor  # (I,3,4)
     near: Tensor  # (I,) smallest useful t
     points: Tensor  # (K,3) SfM points
-    masked: Tensor  # (N,) whether a person's own mask leaves the pixel out; (0,) without masks
+    masked: Tensor  # (N,) whether a user's mask file excludes the pixel; (0,) without such files
     thumbs: Tensor  # (I,3,n,n) uint8, whole photos for the mask network
-    static: Tensor  # (I,n/2,n/2) mask pixels that show SfM points; some wrongly, at outlines [D7]
-    train: Tensor  # (B,) indices of the training photos
-    test: Tensor  # (B,) indices of the held-out photos
+    static: Tensor  # (I,n/2,n/2) mask pixels where SfM points project, some behind outlines [D7]
+    train: Tensor  # (.,) indices of the training photos
+    test: Tensor  # (.,) indices of the held-out photos
     raw: dict  # the file in numpy: names, statistics, center, scale, ground truth of the toy
     info: dict  # what the file was made from
 
@@ -227,7 +231,7 @@ class Rays(NamedTuple):
     uv: Tensor  # (R,2) pixel position over photo size, 0..1
     rgb: Tensor  # (R,3) the photo's colour
     is_static: Tensor  # (R,) whether the mask's pixel shows an SfM point [D7]
-    is_masked: Tensor  # (R,) whether a person's own mask leaves the pixel out
+    is_masked: Tensor  # (R,) whether a user's mask file excludes the pixel
 
     def at(self, t):
         """Points (R,S,3) at distances t (R,S)."""
@@ -344,7 +348,7 @@ class Octree(nn.Module):
         self.root = root
         resolution = root * 2.0 ** torch.arange(levels)
         self.resolution = nn.Buffer(resolution, persistent=False)  # (L,) cells along an axis
-        self.features = torch.zeros(0, channels)  # (V,C), none at first; build adds parameters
+        self.features = torch.zeros(0, channels)  # (V,C), none yet; build makes it a parameter
         self.corner_key = nn.Buffer(torch.arange(0), persistent=False)
         self.build(self.corner_key)  # no cell is split
 
@@ -401,7 +405,7 @@ class Octree(nn.Module):
         level (P,L); whether that level has a cell there (P,L); the place in it, 0..1 (P,L,3). An x
         outside the cube is moved to its border."""
         place = 0.5 + x * (0.5 / self.half)  # (P,3) over the cube
-        place = place.clamp(0, 1 - 1e-6).nan_to_num()  # a diverging run ends at its next log line
+        place = place.clamp(0, 1 - 1e-6).nan_to_num()  # `report` ends a run that diverges
         place = place[:, None] * self.resolution[:, None]  # (P,L,3) in cells
         index = place.long()  # (P,L,3)
         octants = pack_index(index & 1, base=2)  # (P,L)
@@ -465,7 +469,7 @@ def cells_to_split(octree):
     found, worst = (error * can_split).sort(descending=True)  # (N,)
     error_before = found.cumsum(0) - found  # (N,) in worse cells
     is_chosen = error_before < SPLIT_SHARE * found.sum()
-    room = (MAX_CELLS - len(level)) // 8  # seeding leaves most of it
+    room = (MAX_CELLS - len(level)) // 8  # positive, as seeding makes far fewer cells
     return octree.cells[worst[is_chosen][:room]]
 
 
@@ -576,7 +580,7 @@ def lipschitz_loss(network):
 
 # ---- 5 From SDF to colour: alpha, compositing, samples, background -------------------------------
 
-PROBES = 64  # intervals of a ray in which a cache is looked up, to place samples
+PROBES = 64  # even intervals of a ray at whose ends the cache is looked up, to place samples
 UNIFORM_SHARE = 0.25  # weight of evenly spread samples, so that a lost surface can return
 
 
@@ -633,9 +637,9 @@ class SDFCache(nn.Module):
         return voxel * (2 / (n - 1)) - 1
 
     def refresh(self, sdf, turn=None):
-        """Evaluates sdf, (P,3) to (P,), again: at all voxels in the sphere; or, in turn 0, 1, ...,
-        at the eighth of them that is nearest to the surface, and at one eighth of all after the
-        other."""
+        """Evaluates sdf, (P,3) to (P,), again. turn None: at every voxel in the sphere. turn k: at
+        the eighth of them that is nearest to the surface, and at every eighth voxel from k % 8 on,
+        so that eight turns cover all."""
         s = self.volume[0, 0].flatten()  # (n^3,)
         chosen = [self.inside]
         if turn is not None:
@@ -791,12 +795,12 @@ def render_rays(model, rays, code, random, points):
 # ---- 6 Photos in the wild: transient mask and geometry preservation ------------------------------
 
 LAMBDA_GRAD, LAMBDA_CURV = 10.0, 2.0  # of Eq. 4 (paper)
-MASK_TRAINING = 0.6  # share of training in which the mask learns; longer, it would give people up
+MASK_TRAINING = 0.6  # share of training; then M is fixed, as errors of memorised people are small
 REJECTION = 0.3  # share of training in which outliers are rejected
 MIN_THRESHOLD = 0.15  # no smaller error makes a pixel transient
 PLACE_CELLS = 32  # along an axis, of the table of errors over contracted space
-PLACE_QUANTILE = 0.2  # of the errors at a place: what nearly all photos have in common
-PLACE_FACTOR = 1.5  # times that quantile is usual for the place
+PLACE_QUANTILE = 0.2  # of the errors at a place in all photos; low, so that people hardly raise it
+PLACE_FACTOR = 1.5  # an error up to so many times that quantile is usual for the place
 QUANTILE_RATE = 0.1  # how fast running quantiles move, as a logarithm per step
 
 
@@ -815,7 +819,8 @@ def edge_indicator(complexity, opacity, quantiles):
 
 
 def gpl_loss(mask, phi):
-    """L_GPL, Eq. 3: the mean of M(r) Phi(r); the mask must not erase edges of the structure."""
+    """L_GPL, Eq. 3: the mean of M(r) Phi(r); the mask must not erase edges of the structure. Phi
+    has no gradient: the loss moves the mask, never the SDF."""
     return (mask * phi).mean()
 
 
@@ -900,7 +905,7 @@ class TransientMask(nn.Module):
         nn.init.constant_(self.heads[0].bias, -2.5)  # starts with 8 % masked, not with half
         self.thumbs = nn.Buffer(scene.thumbs, persistent=False)
         self.levels = nn.Buffer(torch.tensor([0.5, 0.75, 0.95]), persistent=False)
-        self.complexity = nn.Buffer(torch.tensor([0.5, 1.0, 4.0]))  # (3,) its quantiles
+        self.complexity_quantiles = nn.Buffer(torch.tensor([0.5, 1.0, 4.0]))  # (3,)
         self.sfm_error = nn.Buffer(torch.tensor([0.3]))  # (1,) upper quartile at SfM pixels
         self.place_error = nn.Buffer(torch.full((PLACE_CELLS**3,), 0.1))  # lower quantile
 
@@ -926,7 +931,7 @@ class TransientMask(nn.Module):
         R = len(error)
         of_three = torch.arange(3, device=error.device).repeat_interleave(R)  # (3R,)
         update_running_quantiles(
-            self.complexity,
+            self.complexity_quantiles,
             self.levels[of_three],
             of_three,
             out["complexity"].repeat(3),
@@ -1054,8 +1059,9 @@ class GeoNVS(nn.Module):
         residual = (out["rgb"] - rays.rgb).abs()  # (R,3)
         error = residual.detach().amax(1)  # (R,) of the worst channel
 
-        geometry = complexity(out["ray_e_grad"], out["ray_e_curv"])  # (R,)
-        phi = edge_indicator(geometry, out["opacity"].detach(), self.mask.complexity)  # (R,)
+        ray_complexity = complexity(out["ray_e_grad"], out["ray_e_curv"])  # (R,)
+        opacity = out["opacity"].detach()
+        phi = edge_indicator(ray_complexity, opacity, self.mask.complexity_quantiles)  # (R,)
         reg = error.new_zeros(())
         gpl = error.new_zeros(())
         mask = torch.zeros_like(error)
@@ -1084,7 +1090,7 @@ class GeoNVS(nn.Module):
         log = loss | dict(
             mse=residual.square().mean(),
             mask=mask.mean())  # rejected rays count as 1
-        out |= dict(error=error, mask=mask, complexity=geometry)
+        out |= dict(error=error, mask=mask, complexity=ray_complexity)
         return total, log, out
 
     def before_step(self, step, done):
@@ -1216,7 +1222,7 @@ class State:
     """What a run has done so far."""
     step: int = 0
     seconds: float = 0.0
-    joules: float = 0.0
+    joules: float | None = 0.0  # None once a counter has failed
 
 
 def from_first_process(value):
@@ -1297,7 +1303,7 @@ def save_checkpoint(path, model, optimizer, gen, state):
     saved = dict(
         config=vars(model.cfg),
         scene=scene_facts(model.scene),
-        octrees=[octree.split_keys for octree in model.octrees],
+        octrees=[octree.split_keys.clone() for octree in model.octrees],
         model=model.state_dict(),
         optimizer=optimizer.state_dict(),
         generator=gen.get_state(),
@@ -1333,6 +1339,8 @@ def restore(saved, model, gen=None):
         for octree, keys in zip(model.octrees, saved["octrees"], strict=True):
             octree.build(keys.to(octree.child.device))
         model.load_state_dict(saved["model"])
+        if RANK > 0:  # the errors of all processes are summed again
+            model.sdf.octree.cell_error.zero_()
         optimizer = make_optimizer(model)
         groups = optimizer.state_dict()["param_groups"]  # learning rates may be given anew
         optimizer.load_state_dict(dict(saved["optimizer"], param_groups=groups))
@@ -1483,7 +1491,7 @@ def fit_codes(model, scene, photos, steps=128, n=64):
         return codes
     adam = torch.optim.Adam([codes.requires_grad_()])
     img = photos.repeat_interleave(n)  # (Bn,)
-    for step in progress(range(steps), "fitting the light of held-out photos"):
+    for step in progress(range(steps), "fitting codes of held-out photos"):
         adam.param_groups[0]["lr"] = 0.1 * 0.1 ** (step / steps)
         rays = random_rays(scene, img, gen, part=0.5)
         rgb = model.render(rays, codes.repeat_interleave(n, 0))["rgb"]
@@ -1743,11 +1751,10 @@ def peak_memory(device):
 
 
 def model_bytes(model):
-    """Bytes of parameters and of all tensors of octrees."""
+    """Bytes of parameters and of the octrees' buffers."""
     tensors = list(model.parameters())
     for octree in model.octrees:
         tensors += octree.buffers()
-        tensors += filter(torch.is_tensor, vars(octree).values())
     return sum(tensor.nbytes for tensor in tensors)
 
 
@@ -1801,7 +1808,7 @@ def finish(model, scene, state, run):
     scores, codes = evaluate(model, scene, make_lpips(), run / "held_out")
     atomic_write(run / "codes.npy", lambda part: np.save(part, codes.cpu()))
     write_panel(run / "panel.png", model, scene, codes)
-    if model.octrees:  # a rival has none
+    if model.octrees:  # baselines of test_geonvs.py have none
         scores["octree_cells"] = model.sdf.octree.cells[:, 0].bincount().tolist()  # by level
         write_mesh(run / "mesh.ply", model)
         if "wall" in scene.raw:  # the toy

@@ -1803,7 +1803,9 @@ def plain_errors(model, x):
     """E_grad and E_curv (2,) of the cached volume at x (3,)."""
     at = (x.detach() + 1) / 2 * (model.cache.n - 1)  # in voxels
     channels = model.cache.volume[0, 1:]
-    found = [map_coordinates(volume, at[:, None], order=1, mode="nearest")[0] for volume in channels]
+    found = []
+    for volume in channels:
+        found += list(map_coordinates(volume, at[:, None], order=1, mode="nearest"))
     return torch.tensor(found)
 
 
@@ -2091,7 +2093,7 @@ def plain_losses(model, rays, done):
     near_sfm = sfm + 0.1 * (2 * geonvs.uniform(gen, 2, 3) - 1)
     points = torch.cat([sfm, near_sfm])
     out = geonvs.render_rays(model, rays, model.appearance(rays.img), jitter, points)
-    p50, p75, p95 = model.mask.complexity.tolist()
+    p50, p75, p95 = model.mask.complexity_quantiles.tolist()
     least = max(0.15, cfg.mask_margin + model.mask.sfm_error.item())
     pull = min(40, model.zeta().item())
     terms = defaultdict(float)
@@ -2141,7 +2143,7 @@ def test_the_objective_and_its_gradients_equal_plain_loops(
         double, mask, zeta, sfm_error, done):
     model, rays, photos = rough_case(mask=mask, lam_gpl=0.4, lam_mask=0.7)
     model.deviation.data.fill_(math.log(zeta) / 10)
-    model.mask.complexity.copy_(torch.tensor([1.0, 6, 20]))
+    model.mask.complexity_quantiles.copy_(torch.tensor([1.0, 6, 20]))
     model.mask.sfm_error.fill_(sfm_error)
     model.mask.place_error.uniform_(0, 0.4)
     total, log, _ = model.losses(rays, photos, done, generator())
