@@ -709,7 +709,7 @@ def toy_walls(scene, wall, background, landmark):
 
 # ---- from photos, poses and points to a scene ------------------------------------------
 def find_sphere(x, weight, tracks, is_test, contain):
-    """Centre (3,) and radius of what most photos look at; its definition is [D10].
+    """Centre (3,) and radius of what most photos look at; its definition is [D7].
 
     Centre: geometric median of points x (K,3) by weight. Radius: 1.1 x the distance of
     95 %; if that is a skyline, more than four times the median distance away, only

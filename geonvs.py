@@ -35,12 +35,14 @@ Departures from the printed paper; the tag stands at the code
   [D2]  E_curv is |lap s| times the step of the differences (eps in L_curv, a voxel in Phi): at a
         crease lap s grows as the step shrinks; Phi's sigmoid is calibrated by running quantiles
   [D3]  L_reg classifies pixels as transient by a threshold on their error; outliers are rejected
+        at first; M has no gradient in L_rgb, and is fixed after 60 % of training
   [D4]  L_lps is a sum of logarithms, not a product
   [D5]  CGNet is reduced to three stages and reads small square photos
   [D6]  the background field also renders what lies before the sphere
   [D7]  SfM points place the sphere, seed the octree, pull s to zero and keep M at zero; they stand
         for the off-surface penalty and the sphere loss
-  [D8]  samples follow a cached SDF; derivatives are taken at one surface point per ray
+  [D8]  samples and Phi follow a cached SDF; derivatives are taken at one surface point per ray,
+        as they cost five lookups
   [D9]  zeta stays between a rising floor and a fixed bound
   [D10] cells split where colours err and are never pruned; parts that a scene does not need are off
 """
@@ -662,7 +664,7 @@ class SDFCache(nn.Module):
         return self.lookup(x, slice(0, 1))[0]
 
     def errors(self, x):
-        """E_grad and E_curv (R,) of rays with samples x (R,N,3): ray-wise averages. Eq. 4"""
+        """E_grad and E_curv (R,) of rays with samples x (R,N,3): ray-wise averages. Eq. 4 [D8]"""
         return self.lookup(x, slice(1, 3)).mean(2)
 
     @torch.no_grad()
@@ -812,7 +814,8 @@ def complexity(e_grad, e_curv):
 def edge_indicator(complexity, opacity, quantiles):
     """Phi (R,): the calibrated sigmoid of Eq. 4, times opacity. It is 0.5 at the upper quartile of
     the complexity of rays that end on the foreground; quantiles (3,): the median, that quartile and
-    95 %. A plain sigmoid is at least 0.5 on every ray, which protects all alike. [D2]"""
+    95 %. A plain sigmoid is at least 0.5 on every ray, which protects all alike; a ray through air
+    has no edge. [D2]"""
     p50, p75, p95 = quantiles
     width = ((p95 - p50) / 4).clamp_min(1e-3)
     return opacity * torch.sigmoid((complexity - p75) / width)
@@ -1079,13 +1082,13 @@ class GeoNVS(nn.Module):
 
         pull = self.zeta().detach().clamp_max(MAX_PULL)  # at first s must be free to change [D7]
         loss = dict(
-            rgb=((1 - mask) * residual.mean(1)).mean(),
+            rgb=((1 - mask) * residual.mean(1)).mean(),  # [D3]
             eik=out["e_grad"].mean(),  # at surface points, at SfM points and near them [D8]
             curv=out["e_curv"].mean(),
             reg=reg,
             gpl=gpl,
             lps=lipschitz_loss(self.color),
-            sfm=pull * out["sdf"][:len(sfm)].abs().mean())
+            sfm=pull * out["sdf"][:len(sfm)].abs().mean())  # instead of an off-surface penalty
         total = objective(loss, cfg)
         log = loss | dict(
             mse=residual.square().mean(),
@@ -1156,7 +1159,7 @@ class GeoNVS(nn.Module):
         optimizer.state[octree.features] = state
         for group in optimizer.param_groups:
             if group["name"] == "grids":
-                group["params"] = [octree.features for octree in self.octrees]
+                group["params"] = [tree.features for tree in self.octrees]
 
     @torch.no_grad()
     def decide_mask(self):
@@ -1400,6 +1403,10 @@ def train(cfg, scene, run, saved=None):
     if saved:
         optimizer, state = restore(saved, model, gen)
     done = share_done(cfg, state)
+    if done >= MASK_TRAINING:  # as --steps may have been given anew
+        model.decide_mask()
+    if done >= 1:
+        model.after_training()
     if done < 1 and RANK == 0:
         remove_results(run, () if saved else PROGRESS)
     meter = metered_joules(gen.device, state.joules)
@@ -1649,11 +1656,12 @@ def extract_mesh(model):
     cache = model.cache
     s = cache.volume[:, :1]
     volume = F.interpolate(s, n + 1, mode="trilinear", align_corners=True)[0, 0]
-    near = volume.abs() < 6 / cache.n
+    square = torch.linspace(-1, 1, n + 1, device=volume.device) ** 2
+    square = square[:, None, None] + square[:, None] + square  # (n+1,n+1,n+1) squared radius
+    near = (square < 1.1) & (volume.abs() < 6 / cache.n)
     volume[near] = in_chunks(model.distance, near.nonzero() * (2 / n) - 1)
     volume = volume.cpu().numpy()
-    square = np.linspace(-1, 1, n + 1) ** 2
-    is_inside = square[:, None, None] + square[:, None] + square < 1  # (n+1,n+1,n+1)
+    is_inside = (square < 1).cpu().numpy()
     if len(np.unique(volume[is_inside] < 0)) < 2:
         return [np.zeros((0, 3))] * 2
     vertices, faces, _, _ = marching_cubes(volume, 0, mask=is_inside)

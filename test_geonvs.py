@@ -14,7 +14,6 @@ import json
 import math
 import os
 import re
-import resource
 import shutil
 import signal
 import socket
@@ -2062,7 +2061,7 @@ def test_statistics_follow_the_rays_they_are_about(warm):
     close(octree.cell_error, wanted)
     for _ in range(400):
         warm.update_statistics(rays, out)
-    is_below = out["complexity"][:40, None] < warm.mask.complexity
+    is_below = out["complexity"][:40, None] < warm.mask.complexity_quantiles
     close(is_below.float().mean(0), [0.5, 0.75, 0.95], 0.02)
     is_used = ~rays.is_masked
     cell = geonvs.place_cell(torch.zeros(1, 3))
@@ -2163,7 +2162,7 @@ def test_gpl_trains_the_mask_and_nothing_else(warm):
         assert grad.any() == name.startswith("mask"), name
 
 
-def test_colours_under_a_persons_mask_teach_nothing(warm):
+def test_colours_under_a_persons_mask_train_nothing(warm):
     twin = copy.deepcopy(warm)
     rays, photos = make_batch(warm)
     index = torch.arange(64)
@@ -2547,6 +2546,8 @@ def test_refining_and_deciding_on_the_mask_come_at_their_shares_of_training(loop
     loop.reset_mock()
     run_training(saved, steps=20)
     events = [name for name, _, _ in loop.mock_calls]
+    if start >= 12:  # steps may have been given anew
+        assert events.pop(0) == "decide_mask"
     wanted = ["step"] * 20
     wanted.insert(12, "decide_mask")
     for step in (12, 9, 6, 4, 2):  # shares 0.6, 0.45, 0.3, 0.2, 0.1
@@ -3278,6 +3279,7 @@ def test_a_mistake_ends_with_code_2_and_one_line_and_no_folder(command, flags, w
 def test_a_full_disk_leaves_the_old_checkpoint(command):
     command(FLAGS)
     before = CHECKPOINT.read_bytes()
+    import resource  # Windows has none
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, hard))  # a larger file cannot be written
     try:
@@ -3349,7 +3351,7 @@ def test_each_setting_is_used_and_is_a_flag_with_its_meaning_and_default():
 
 # ==== Part II: the rivals, and the experiments by name ============================================
 #     python test_geonvs.py chart    speed against accuracy: Geo-NVS-w and its rivals by budget
-#     python test_geonvs.py pieces   what each piece of the method buys
+#     python test_geonvs.py pieces   ablation; the equations as in the paper; density for SDF
 #     python test_geonvs.py grid     the octree against a uniform grid
 #     python test_geonvs.py stress   where methods fail: cells of the toy with knobs turned together
 # Flags of geonvs.py apply (--data, --downscale, --minutes, --steps ...) unless a row sets them, and
@@ -3881,7 +3883,8 @@ class Density(NoNormal):
     """An octree NeRF-W: the field is a density exp(-10 s) instead of a distance."""
     def alpha(self, sdf, t, max_zeta=math.inf):
         mean = (sdf[:, :-1] + sdf[:, 1:]) / 2  # (R,S)
-        return 1 - torch.exp(-torch.exp(-10 * mean) * t.diff())
+        sigma = torch.exp(-10 * mean.clamp(-2, 2))
+        return 1 - torch.exp(-sigma * t.diff())
 
 
 def dense_octree(octree, points, dense):
@@ -4128,8 +4131,8 @@ def draw_chart(table):
 
 
 def draw_bars(table, is_stress):
-    """What each row gains over the first row, the best one last; in `stress` over the trivial
-    predictor, coloured by method."""
+    """What each row gains over the first row, the best one last; in `stress` over the row
+    means of the left half, coloured by method."""
     from matplotlib import figure as figures
     rows = [line for line in table if line["psnr"]]
     if not is_stress:
