@@ -722,7 +722,8 @@ class Background(nn.Module):
         near = rays.near.lerp(t0, place[:, :n] / n)  # (R,n)
         u = (place[:, n:] - n) / (S - n)  # (R,S-n)
         far = u / (1 - u).clamp_min(1e-3)
-        path = torch.cat([near, t0 + far], 1)  # (R,S) without the sphere, for lengths
+        near_length = torch.cat([near, t0], 1).diff()  # (R,n)
+        length = torch.cat([near_length, far.diff()], 1)  # (R,S-1)
         t = torch.cat([near, t1 + far], 1)  # (R,S)
         x = contract(rays.at(t))  # (R,S,3)
         inputs = torch.cat([x, self.octree(x)], 2)  # (R,S,3+LC)
@@ -730,7 +731,7 @@ class Background(nn.Module):
         sigma, geo = out.split([1, GEOMETRY_FEATURES], 2)
         rgb = colors_of(self.color, geo, per_ray)  # (R,S,3)
         sigma = F.softplus(sigma[..., 0] - 1)  # (R,S)
-        alpha = 1 - torch.exp(-sigma[:, :-1] * path.diff())  # (R,S-1)
+        alpha = 1 - torch.exp(-sigma[:, :-1] * length)  # (R,S-1)
         w = composite(F.pad(alpha, (0, 1), value=1.0))  # (R,S)
         near_w, far_w = w.split([n, S - n], 1)
         near_rgb, far_rgb = rgb.split([n, S - n], 1)

@@ -1832,7 +1832,8 @@ def plain_background(model, o, d, near, t0, t1, per_ray, jitter):
         places.append(x)
         sigmas.append(F.softplus(out[0] - 1))
         colors.append(color.sigmoid())
-    depths = torch.stack(sigmas[:-1]) * torch.stack(path).diff()  # optical
+    ends = torch.stack([*path[1:n], t0, *path[n + 1:]])  # near samples end at the sphere
+    depths = torch.stack(sigmas[:-1]) * (ends - torch.stack(path[:-1]))  # optical
     alphas = 1 - torch.exp(-depths)
     w = plain_weights([*alphas, 1])
     colors = torch.stack(colors)
