@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Scene files for geonvs.py: a synthetic landmark, or photos with a COLMAP reconstruction.
 
     python data_prep.py toy --occluders 0.4     a toy -> data/toy.npz

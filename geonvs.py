@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Geo-NVS-w: a signed distance field, trained on tourist photos, rendered from new viewpoints.
 
 A minimal single-file reference implementation of "Geo-NVS-w: Geometry-Aware Novel View Synthesis

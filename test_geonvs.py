@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Part I: tests, in the order of data_prep.py and geonvs.py. Part II: rivals and experiments.
 
 The tests come from properties: plain loops in float64, closed forms, limits, invariances, round
