@@ -42,7 +42,6 @@ from urllib.request import Request, urlopen
 
 import cv2
 import numpy as np
-from numpy.linalg import norm
 
 # name: (archive, split file)
 SCENES = {
@@ -89,7 +88,7 @@ FAR = 1e9  # sound reconstructions have no larger number; float32 holds its squa
 
 
 class UserError(Exception):
-    """Something that the person at the keyboard can mend: one sentence that says how."""
+    """Something that the person at the keyboard can correct: one sentence that says how."""
 
 
 def check(ok, message):
@@ -200,14 +199,14 @@ def read_scene(path):
 
 def lengths(x):
     """Of vectors (P,3) -> (P,)"""
-    return norm(x, axis=1)
+    return np.linalg.norm(x, axis=1)
 
 
 # ---- the toy: z up, front towards -y, in its own units ---------------------------------
 TOY_SCALE = 3.7  # world = TOY_SCALE * x + TOY_ORIGIN
 TOY_ORIGIN = np.array([12.0, -7.0, 5.0])
 SUN = np.array([-0.50, -0.62, 0.60])  # left, behind the tourists
-SUN /= norm(SUN)
+SUN /= np.linalg.norm(SUN)
 
 
 class Material(NamedTuple):
@@ -531,9 +530,9 @@ def toy_camera(rng, azimuth, size):
     place = target + away * rng.choice((0.8, 1), p=(0.1, 0.9))
     place[2] = max(place[2], 0.2)
     z = target - place
-    z /= norm(z)
+    z /= np.linalg.norm(z)
     x = np.cross(z, (*rng.normal(0, 0.03, 2), 1))  # hardly anyone holds it level
-    x /= norm(x)
+    x /= np.linalg.norm(x)
     c2w = np.stack([x, np.cross(z, x), z, place], 1)
     return (f, f, w / 2, h / 2), c2w, w, h
 
@@ -612,7 +611,7 @@ def toy_points(rng, photos):
 def shake_camera(rng, K, c2w, pixels):
     """Moves c2w, in the toy's units, by noise of `pixels` rms at the landmark."""
     *turn, dx, dy = rng.normal(0, pixels / 2, 4) / K[0]  # [rad]: turned, and moved
-    c2w[:, 3] += c2w[:, :2] @ (dx, dy) * norm(c2w[:, 3])
+    c2w[:, 3] += c2w[:, :2] @ (dx, dy) * np.linalg.norm(c2w[:, 3])
     c2w[:, :3] @= cv2.Rodrigues((*turn, 0))[0]
 
 
@@ -939,7 +938,7 @@ def check_photo(camera, pose, is_test):
 
 def camera_to_world(pose):
     """COLMAP's world to camera, quaternion and translation (7,) -> c2w (3,4)"""
-    w, *v = pose[:4] / norm(pose[:4])  # old files are not normalised
+    w, *v = pose[:4] / np.linalg.norm(pose[:4])  # old files are not normalised
     turn = np.cross(v, np.eye(3))
     R = np.eye(3) + 2 * w * turn + 2 * turn @ turn
     return np.column_stack([R, -R @ pose[4:]])
@@ -1325,10 +1324,10 @@ def read_usable(model, points, rows, held_out, downscale):
         del usable[name]
     lost = [name for name in held_out if held_out[name] and name not in usable]
     check(not lost,
-          f"held-out photos cannot be used, mend them or hold out others: {lost}")
+          f"held-out photos cannot be used, repair them or hold out others: {lost}")
     count = sum(not held_out[name] for name in usable)
     check(count >= 2,
-          f"{count} usable training photos are too few: mend them or the split file")
+          f"{count} usable training photos are too few: repair them or the split file")
     return usable
 
 

@@ -1454,7 +1454,7 @@ def remove_results(run, more):
 def report(model, path, done, state, terms):
     """A line on the terminal and one in log.jsonl. psnr: of the step's rays, people included."""
     check(all(p.isfinite().all() for p in model.parameters()),
-          "weights are no longer finite: mend poses, or try a third of the learning rates "
+          "weights are no longer finite: correct the poses, or try a third of the learning rates "
           f"--lr_grid and --lr_net; checkpoint.pt beside {path}, if any, is from before")
     numbers = {key: value.item() for key, value in terms.items()}
     numbers["psnr"] = -10 * math.log10(numbers["mse"] + 1e-10)
@@ -1971,7 +1971,8 @@ def run_command_line(entry):
     except UserError as error:
         message = str(error)
     except OSError as error:  # a full disk, a folder without permission
-        message = f"{error}: mend that; a run that has a checkpoint goes on with --resume"
+        message = (f"{error}: make room or choose another place; a run that has a checkpoint goes "
+                   "on with --resume")
     except (RuntimeError, MemoryError) as error:  # a CPU's allocator has no error of its own
         if isinstance(error, RuntimeError) and "allocate" not in str(error):
             raise

@@ -911,7 +911,7 @@ def test_bad_photos_are_found_in_one_go(model):
     code, out, err = run_main()
     assert code == 2
     assert re.findall("left out: (.*).png has", err) == ["toy_000", "toy_004", "toy_007"]
-    assert err.endswith("mend them or hold out others: ['toy_007.png']\n")
+    assert err.endswith("repair them or hold out others: ['toy_007.png']\n")
 
 
 def test_photos_are_turned_only_if_that_fits(model, source):
