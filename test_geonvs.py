@@ -2780,7 +2780,7 @@ def test_several_processes_count_the_seconds_up_to_the_last_step(loop, monkeypat
     assert state.seconds == 10  # one look at the clock
 
 
-def test_the_first_process_makes_the_scene_before_the_others_open_it(monkeypatch):
+def test_the_first_process_makes_the_scene_before_the_others_open_it(desk, monkeypatch):
     events = mock.Mock()
     events.open.side_effect = [None, KeyboardInterrupt]
     monkeypatch.setattr(geonvs, "RANKS", 2)
