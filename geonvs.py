@@ -142,7 +142,6 @@ class Config:
     lam_gpl: float = 0.05  # weight of L_GPL, the geometry-preservation loss (paper)
     lam_lps: float = 1e-5  # weight of L_lps, the Lipschitz loss, log form [D4]
     lam_sfm: float = 7.5e-3  # weight of min(zeta, 40) |s(p)| at SfM points [D7]
-    mask_margin: float = 0.04  # error above that of SfM pixels that makes a pixel transient [D3]
     lr_grid: float = 1e-2  # learning rate of octree features
     lr_code: float = 3e-2  # learning rate of appearance codes
     lr_net: float = 4e-3  # learning rate of networks
@@ -165,8 +164,8 @@ class Config:
 
 # settings of photos on a GPU that differ from Config's defaults; flags override them
 GPU_DEFAULTS = dict(
-    steps=300_000,
-    rays=4096,
+    steps=75_000,
+    rays=16_384,  # on an H100 a step takes as long with fewer: it waits for the CPU's launches
     photos=16,
     samples=32,
     appearance_dim=32)
@@ -251,14 +250,14 @@ def make_rays(scene, img, pixel):
     d = (xy - centre) / focal  # (R,2)
     d = F.normalize(F.pad(d, (0, 1), value=1.0))  # (R,3) in camera axes
     d = torch.einsum("rij,rj->ri", c2w[..., :3], d)  # (R,3) in world axes
-    place = scene.start[img] + pixel  # (R,)
-    rgb = scene.rgb[place] / 255
+    index = scene.start[img] + pixel  # (R,) among all pixels
+    rgb = scene.rgb[index] / 255
     uv = xy / wh  # (R,2)
     col, row = (uv * scene.static.shape[1]).long().unbind(1)  # (R,) of the mask's pixel
     is_static = scene.static[img, row, col]
     is_masked = torch.zeros_like(is_static)
     if len(scene.masked):
-        is_masked = scene.masked[place]
+        is_masked = scene.masked[index]
     return Rays(c2w[..., 3], d, scene.near[img, None], img, uv, rgb, is_static, is_masked)
 
 
@@ -316,9 +315,9 @@ class WeightedSum(torch.autograd.Function):
     @staticmethod
     def backward(ctx, grad):  # (P,C)
         table, row, w = ctx.saved_tensors
-        share = w[..., None] * grad[:, None]  # (P,8,C)
+        grad = w[..., None] * grad[:, None]  # (P,8,C)
         out = torch.zeros_like(table)  # (V,C)
-        out.index_add_(0, row.flatten().long(), share.flatten(0, 1))
+        out.index_add_(0, row.flatten().long(), grad.flatten(0, 1))
         return out, None, None
 
 
@@ -404,13 +403,13 @@ class Octree(nn.Module):
         return is_old
 
     def locate(self, x):
-        """For x (P,3) and each level: the row in cells of the finest cell around x down to that
-        level (P,L); whether that level has a cell there (P,L); the place in it, 0..1 (P,L,3). An x
-        outside the cube is moved to its border."""
-        place = 0.5 + x * (0.5 / self.half)  # (P,3) over the cube
-        place = place.clamp(0, 1 - 1e-6).nan_to_num()  # `report` ends a run that diverges
-        place = place[:, None] * self.resolution[:, None]  # (P,L,3) in cells
-        index = place.long()  # (P,L,3)
+        """Where points x (P,3) lie in each level: the row in cells (P,L) of the finest cell around x
+        down to that level; whether the level has a cell there (P,L); the position in it, 0..1
+        (P,L,3). An x outside the cube is moved to its border."""
+        x = 0.5 + x * (0.5 / self.half)  # (P,3) over the cube
+        x = x.clamp(0, 1 - 1e-6).nan_to_num()  # `report` ends a run that diverges
+        x = x[:, None] * self.resolution[:, None]  # (P,L,3) in cells
+        index = x.long()  # (P,L,3)
         octants = pack_index(index & 1, base=2)  # (P,L)
         node = pack_index(index[:, 0], base=self.root)  # (P,) of level 0
         nodes = [node]
@@ -421,14 +420,14 @@ class Octree(nn.Module):
             node = torch.where(has_child, child + octant, node)
             nodes.append(node)
             exists.append(has_child)
-        return torch.stack(nodes, 1), torch.stack(exists, 1), place.frac()
+        return torch.stack(nodes, 1), torch.stack(exists, 1), x.frac()
 
     def forward(self, x):
         """Features (...,LC) at x (...,3)."""
-        node, exists, place = self.locate(x.flatten(0, -2))  # of P points
+        node, exists, local = self.locate(x.flatten(0, -2))  # of P points
         node = node.flatten()  # (PL,)
         is_hanging = self.is_hanging.index_select(0, node)  # (PL,8)
-        w = trilinear_weights(place.flatten(0, 1))  # (PL,8)
+        w = trilinear_weights(local.flatten(0, 1))  # (PL,8)
         w = w.masked_fill(is_hanging | ~exists.reshape(-1, 1), 0)
         corner = self.corner.index_select(0, node)  # (PL,8)
         feat = WeightedSum.apply(self.features, corner, w)  # (PL,C)
@@ -647,8 +646,8 @@ class SDFCache(nn.Module):
         chosen = [self.inside]
         if turn is not None:
             distance = s[self.inside].abs()
-            near = distance.topk(len(distance) // 8, largest=False, sorted=False).indices
-            chosen = [self.inside[near], self.inside[turn % 8::8]]
+            nearest = distance.topk(len(distance) // 8, largest=False, sorted=False).indices
+            chosen = [self.inside[nearest], self.inside[turn % 8::8]]
         for index in chosen:
             s[index] = in_chunks(sdf, self.points(index))
         s = s.view_as(self.volume[0, 0])
@@ -672,8 +671,8 @@ class SDFCache(nn.Module):
     def sample(self, rays, t0, t1, jitter, alpha):
         """Distances (R,S+1) from t0 to t1 (R,1), dense where a surface is seen. jitter: (R,S-1) in
         0..1, of the stratified samples between the ends; alpha: GeoNVS.alpha."""
-        share = torch.linspace(0, 1, PROBES + 1, device=t0.device)
-        probes = t0.lerp(t1, share)  # (R,N+1)
+        even = torch.linspace(0, 1, PROBES + 1, device=t0.device)
+        probes = t0.lerp(t1, even)  # (R,N+1)
         sdf = self.sdf(rays.at(probes))  # (R,N+1)
         alphas = alpha(sdf, probes, max_zeta=self.n)  # (R,N) surfaces at least half a voxel wide
         weight = composite(alphas)
@@ -719,9 +718,9 @@ class Background(nn.Module):
         is opaque."""
         _, S = jitter.shape
         n = S // 6
-        place = torch.arange(S, device=t0.device) + jitter  # (R,S)
-        near = rays.near.lerp(t0, place[:, :n] / n)  # (R,n)
-        u = (place[:, n:] - n) / (S - n)  # (R,S-n)
+        number = torch.arange(S, device=t0.device) + jitter  # (R,S)
+        near = rays.near.lerp(t0, number[:, :n] / n)  # (R,n)
+        u = (number[:, n:] - n) / (S - n)  # (R,S-n)
         far = u / (1 - u).clamp_min(1e-3)
         near_length = torch.cat([near, t0], 1).diff()  # (R,n)
         length = torch.cat([near_length, far.diff()], 1)  # (R,S-1)
@@ -739,19 +738,28 @@ class Background(nn.Module):
         near_color = torch.einsum("rs,rsc->rc", near_w, near_rgb)
         far_color = torch.einsum("rs,rsc->rc", far_w, far_rgb)
         near_transmittance = 1 - near_w.sum(1, keepdim=True)
-        share = F.normalize(far_w.detach(), p=1, dim=1)
-        far_place = torch.einsum("rs,rsc->rc", share, x[:, n:])
+        far_w = F.normalize(far_w.detach(), p=1, dim=1)
+        far_place = torch.einsum("rs,rsc->rc", far_w, x[:, n:])
         return near_color, near_transmittance, far_color, far_place
 
 
 def render_rays(model, rays, code, random, points):
-    """A batch of rays through the whole model, GeoNVS of section 7. code: (R,A) appearance; random:
-    numbers in 0..1 that place samples, S - 1 columns for the foreground, then the background's;
-    points: (N,3) further places of derivatives. Returns a dictionary: rgb (R,3); opacity (R,) of
-    the foreground; depth (R,), surface_point and place (R,3), where the ray ends on average: on the
-    foreground, and in contracted space; normal (R,3) times opacity and e_curv (R,) at surface
-    points; e_grad (R+N,) at surface points and points; sdf (N,) at points; ray_e_grad and
-    ray_e_curv (R,), averages along the ray. Depth and places have no gradient."""
+    """A batch of rays through the whole model, GeoNVS of section 7.
+        code     (R,A)    appearance
+        random   (R,.)    in 0..1, places samples: S - 1 of the foreground, then the background's
+        points   (N,3)    more points at which derivatives are taken
+    Returns a dictionary. Depth and points have no gradient.
+        rgb            (R,3)
+        opacity        (R,)      of the foreground
+        is_solid       (R,)      whether the foreground covers more than half of the ray
+        depth          (R,)      where the foreground is hit, on average
+        surface_point  (R,3)     the point there
+        place          (R,3)     where the ray ends, in contracted space: there or on the background
+        normal         (R,3)     at the surface point, times opacity
+        e_grad         (R+N,)    E_grad at surface points, then at points
+        e_curv         (R,)      E_curv at surface points
+        sdf            (N,)      at points
+        ray_e_grad, ray_e_curv  (R,)  averages along the ray"""
     fg_random, bg_random = random.tensor_split([model.cfg.samples - 1], 1)
     t0, t1 = sphere_interval(rays)  # (R,1)
     t = model.cache.sample(rays, t0, t1, fg_random, model.alpha)  # (R,S+1)
@@ -766,8 +774,8 @@ def render_rays(model, rays, code, random, points):
     depth = ((hit * t).sum(1) + 1e-3 * t1[:, 0]) / (hit.sum(1) + 1e-3)  # (R,) t1 if it hits nothing
     surface_point = rays.at(depth[:, None])[:, 0]  # (R,3)
     R = len(depth)
-    places = torch.cat([surface_point, points])  # (R+N,3), as one lookup is faster than two
-    s, grad, lap = model.sdf.derivatives(places, model.eps)  # (R+N,), (R+N,3), (R+N,) [D8]
+    points = torch.cat([surface_point, points])  # (R+N,3), as one lookup is faster than two
+    s, grad, lap = model.sdf.derivatives(points, model.eps)  # (R+N,), (R+N,3), (R+N,) [D8]
     normal = F.normalize(grad[:R])
 
     per_ray = torch.cat([rays.d, code], 1)  # (R,3+A)
@@ -855,6 +863,7 @@ def update_running_quantiles(running, level, group, values, is_chosen):
     total = torch.zeros_like(running).index_add_(0, group, excess)
     count = torch.zeros_like(running).index_add_(0, group, is_chosen.float())
     running *= torch.exp(QUANTILE_RATE * total / count.clamp_min(1))
+    running.clamp_min_(1e-6)  # as no factor leads away from 0
 
 
 def place_cell(place):
@@ -911,7 +920,6 @@ class TransientMask(nn.Module):
         self.thumbs = nn.Buffer(scene.thumbs, persistent=False)
         self.levels = nn.Buffer(torch.tensor([0.5, 0.75, 0.95]), persistent=False)
         self.complexity_quantiles = nn.Buffer(torch.tensor([0.5, 1.0, 4.0]))  # (3,)
-        self.sfm_error = nn.Buffer(torch.tensor([0.3]))  # (1,) upper quartile at SfM pixels
         self.place_error = nn.Buffer(torch.full((PLACE_CELLS**3,), 0.1))  # lower quantile
 
     def logits(self, photos):
@@ -924,12 +932,12 @@ class TransientMask(nn.Module):
             logits += F.interpolate(head(y), size, mode="bilinear")
         return logits
 
-    def threshold(self, place, margin):
-        """The error (R,) above which rays are transient: well above the errors at SfM pixels, and
-        unusual for the place (R,3) where the ray ends. What is bad in all photos is the model's
-        fault; what is bad in one photo is a tourist. [D3]"""
+    def threshold(self, place):
+        """The error (R,) above which rays are transient: unusual for the place (R,3) where the ray
+        ends. A place that is bad in all photos is the model's fault; one that is bad in one photo
+        shows a tourist. [D3]"""
         usual = PLACE_FACTOR * self.place_error[place_cell(place)]  # (R,)
-        return torch.maximum(usual, (self.sfm_error + margin).clamp_min(MIN_THRESHOLD))
+        return usual.clamp_min(MIN_THRESHOLD)
 
     def update_quantiles(self, rays, out, error):
         """Follows the quantiles of complexity and error (R,) of a step's rays."""
@@ -941,18 +949,17 @@ class TransientMask(nn.Module):
             of_three,
             out["complexity"].repeat(3),
             out["is_solid"].repeat(3))
-        of_one = torch.zeros_like(rays.img)
-        is_used = ~rays.is_masked
-        update_running_quantiles(self.sfm_error, 0.75, of_one, error, rays.is_static & is_used)
         cell = place_cell(out["place"])
-        update_running_quantiles(self.place_error, PLACE_QUANTILE, cell, error, is_used)
+        update_running_quantiles(self.place_error, PLACE_QUANTILE, cell, error, ~rays.is_masked)
 
 
 # ---- 7 The model and its objective ---------------------------------------------------------------
 
+START_ZETA = 20
 ZETA_FLOOR = 15, 80  # at first, and after ZETA_RISE of training [D9]
 ZETA_RISE = 0.43
 MAX_PULL = 40  # zeta up to which SfM points pull harder
+NEAR_SFM = 0.1  # half the side of the cubes around SfM points in which L_eik is taken, too
 CACHE_EVERY = 64  # steps between renewals of the cache
 
 
@@ -1026,7 +1033,7 @@ class GeoNVS(nn.Module):
             outside = scene.points[~is_inside]
             self.background = Background(outside, cfg.hidden, 3 + A, min(levels, 4))
             self.octrees.append(self.background.octree)
-        self.deviation = nn.Parameter(torch.tensor(math.log(20) / 10))
+        self.deviation = nn.Parameter(torch.tensor(math.log(START_ZETA) / 10))
         self.mask = TransientMask(scene)
         self.cache = SDFCache(64 if levels < 4 else 128)  # as fine as the octree, within bounds
         self.cache.refresh(self.distance)
@@ -1059,7 +1066,7 @@ class GeoNVS(nn.Module):
         code = self.appearance(photos).repeat_interleave(R // len(photos), 0)  # (R,A)
         random = uniform(gen, R, self.random_per_ray)
         sfm = self.sfm[random_index(gen, len(self.sfm), math.ceil(R / 4))]  # (N,3)
-        near_sfm = sfm + 0.2 * uniform(gen, *sfm.shape) - 0.1  # (N,3) in cubes around them
+        near_sfm = sfm + NEAR_SFM * (2 * uniform(gen, *sfm.shape) - 1)  # (N,3)
         out = render_rays(self, rays, code, random, torch.cat([sfm, near_sfm]))
         residual = (out["rgb"] - rays.rgb).abs()  # (R,3)
         error = residual.detach().amax(1)  # (R,) of the worst channel
@@ -1076,7 +1083,7 @@ class GeoNVS(nn.Module):
                 logit = logit.detach()
             M = logit.sigmoid()
             # SfM pixels count as if they had no error: they train M = 0 [D7]
-            excess = error * ~rays.is_static - self.mask.threshold(out["place"], cfg.mask_margin)
+            excess = error * ~rays.is_static - self.mask.threshold(out["place"])
             reg = mask_loss(logit, excess * ~rays.is_masked)
             gpl = gpl_loss(M, phi * ~rays.is_masked)
             mask = reject_outliers(M.detach(), excess > 0, done)
@@ -1298,9 +1305,9 @@ def check_same_scene(saved, now):
         old = np.array(saved[key], float).reshape(rows, -1)
         # a scene file that another machine made may differ in the last digits
         for row, column in np.argwhere(~np.isclose(old, new, rtol=1e-6, atol=1e-6)):
-            place = "the scene" if key == "sphere" else now["name"][row]
+            whose = "the scene" if key == "sphere" else now["name"][row]
             raise UserError(
-                f"checkpoint.pt was trained with other data: {key} of {place}, number {column}, "
+                f"checkpoint.pt was trained with other data: {key} of {whose}, number {column}, "
                 f"was {old[row, column]:.9g} and is {new[row, column]:.9g}: {advice}")
 
 
@@ -1411,6 +1418,7 @@ def train(cfg, scene, run, saved=None):
         model.after_training()
     if done < 1 and RANK == 0:
         remove_results(run, () if saved else PROGRESS)
+        rewind_log(run / "log.jsonl", state.step)
     meter = metered_joules(gen.device, state.joules)
     next(meter, None)  # it counts from here
     begin = time.perf_counter() - state.seconds
@@ -1449,6 +1457,16 @@ def remove_results(run, more):
     for name in (*RESULTS, *more):
         (run / name).unlink(missing_ok=True)
     shutil.rmtree(run / "held_out", ignore_errors=True)
+
+
+def rewind_log(path, step):
+    """Leaves out lines after a step, which a killed process wrote, and a torn one."""
+    if not path.exists():
+        return
+    lines = path.read_text().splitlines(keepends=True)
+    whole = [line for line in lines if line.endswith("}\n")]
+    kept = [line for line in whole if json.loads(line)["step"] <= step]
+    atomic_write(path, lambda part: part.write_text("".join(kept)))
 
 
 def report(model, path, done, state, terms):
@@ -1543,7 +1561,8 @@ def render_photo(model, scene, photo, code):
 def score(rgb, truth, lpips=None):
     """The right half of a rendered photo, rounded to 8 bits, against the truth, beside a baseline
     (psnr_floor): each row of pixels in the mean colour of its left half. SSIM: Gaussian window
-    of 11 px, sigma 1.5, no border. None where a picture is too small."""
+    of 11 px, sigma 1.5, no border. None where a picture is too small. Pixels that a user's mask
+    excludes count as all others do."""
     half = truth.shape[1] // 2
     want = truth[:, half:]
     got = to_uint8(rgb[:, half:]) / 255
@@ -1582,8 +1601,7 @@ def evaluate(model, scene, lpips=None, folder=None):
         row["name"] = name
         rows.append(row)
         if folder:
-            path = Path(folder, name).with_suffix(".png")
-            write_png(path, to_uint8(np.hstack([truth, rgb])))
+            write_png(Path(folder, name + ".png"), to_uint8(np.hstack([truth, rgb])))
     scores = dict(per_image=rows)
     for key in ("psnr", "psnr_floor", "ssim", "lpips"):
         values = [row[key] for row in rows if row[key] is not None]
@@ -1660,8 +1678,8 @@ def extract_mesh(model):
     volume = F.interpolate(s, n + 1, mode="trilinear", align_corners=True)[0, 0]
     square = torch.linspace(-1, 1, n + 1, device=volume.device) ** 2
     square = square[:, None, None] + square[:, None] + square  # (n+1,n+1,n+1) squared radius
-    near = (square < 1.1) & (volume.abs() < 6 / cache.n)
-    volume[near] = in_chunks(model.distance, near.nonzero() * (2 / n) - 1)
+    is_close = (square < 1.1) & (volume.abs() < 6 / cache.n)
+    volume[is_close] = in_chunks(model.distance, is_close.nonzero() * (2 / n) - 1)
     volume = volume.cpu().numpy()
     is_inside = (square < 1).cpu().numpy()
     if len(np.unique(volume[is_inside] < 0)) < 2:
@@ -1718,10 +1736,10 @@ end_header
 def depth_picture(depth, opacity):
     """Depth (H,W) as colours (H,W,3) of bytes: red is near, blue far, black where nothing is."""
     solid = depth[opacity > 0.5]
-    near = solid.min(initial=1e9)
-    far = solid.max(initial=0)
-    share = (far - depth) / max(far - near, 1e-6)
-    color = cv2.applyColorMap(to_uint8(share), cv2.COLORMAP_TURBO)[..., ::-1]
+    nearest = solid.min(initial=1e9)
+    farthest = solid.max(initial=0)
+    nearness = (farthest - depth) / max(farthest - nearest, 1e-6)
+    color = cv2.applyColorMap(to_uint8(nearness), cv2.COLORMAP_TURBO)[..., ::-1]
     return (color * opacity[..., None]).astype(np.uint8)
 
 
@@ -1843,11 +1861,11 @@ def film(model, scene, path):
         check(video.isOpened(), "OpenCV cannot encode VP9: pip install --upgrade "
               "opencv-contrib-python-headless")
         for n in progress(range(96), "filming 96 frames"):
-            share = n / 95
+            phase = n / 95
             c2w = scene.c2w.clone()
-            c2w[..., 3] += 0.1 * math.sin(math.tau * share) * c2w[..., 0]
+            c2w[..., 3] += 0.1 * math.sin(math.tau * phase) * c2w[..., 0]
             view = scene._replace(c2w=c2w)
-            rgb, _, _, _ = render_photo(model, view, photo, first.lerp(last, share))
+            rgb, _, _, _ = render_photo(model, view, photo, first.lerp(last, phase))
             video.write(to_uint8(rgb[..., ::-1]))
         video.release()
         data = part.read_bytes()
@@ -1895,7 +1913,8 @@ def make_config(given):
 def start_processes(device):
     """Joins the processes that torchrun started; the first one speaks."""
     check("MASTER_ADDR" in os.environ, "start processes by torchrun, or unset WORLD_SIZE")
-    dist.init_process_group("cpu:gloo,cuda:nccl" if device.type == "cuda" else "gloo")
+    has_nccl = device.type == "cuda" and dist.is_nccl_available()  # not on Windows
+    dist.init_process_group("cpu:gloo,cuda:nccl" if has_nccl else "gloo")
     if RANK > 0:
         sys.stdout = open(os.devnull, "w", errors="replace")
 
@@ -1918,6 +1937,8 @@ def locked(run):
         raise UserError(f"{run} is in use by another training, or its disk cannot be written or "
                         f"locked ({error}): wait, or train beside it by --name NAME")
     with contextlib.closing(lock):
+        for part in run.glob(".checkpoint.*.pt"):  # half-written, of a killed process
+            part.unlink()
         yield
 
 
