@@ -197,9 +197,37 @@ def read_scene(path):
     return scene
 
 
+# ---- pixels and rays -------------------------------------------------------------------
 def lengths(x):
     """Of vectors (P,3) -> (P,)"""
     return np.linalg.norm(x, axis=1)
+
+
+def ray_directions(K, c2w, w, h, offset=(0.5, 0.5)):
+    """Unit vectors through each pixel's offset, in world axes, row by row. -> (h*w,3)"""
+    uv = np.indices((w, h)).T.reshape(-1, 2)
+    xy = (uv + offset - K[2:]) / K[:2]
+    d = np.column_stack([xy, np.ones(w * h)])
+    d /= lengths(d)[:, None]
+    return d @ c2w[:, :3].T
+
+
+def project(K, c2w, x):
+    """Pixels (P,2), -1e9 behind the camera, and distances (P,) of points x (P,3)."""
+    p = (x - c2w[:, 3]) @ c2w[:, :3]
+    z = p[:, 2:]
+    uv = p[:, :2] / np.maximum(z, 1 / FAR) * K[:2] + K[2:]
+    return np.where(z > 0, uv, -1e9), lengths(p)
+
+
+def is_in_photo(uv, wh):
+    """Which pixels uv (P,2) lie in a photo of width and height wh. -> (P,)"""
+    return ((uv >= 0) & (uv < wh)).all(1)
+
+
+def pixel_index(uv, wh):
+    """Row-by-row indices of pixels uv (P,2), moved inside a photo of size wh. -> (P,)"""
+    return np.clip(uv, 0, np.subtract(wh, 1)).astype(int) @ (1, wh[0])
 
 
 # ---- the toy: z up, front towards -y, in its own units ---------------------------------
@@ -334,11 +362,6 @@ def toy_landmark(number):
     ]
 
 
-def toy_parts(landmark, background):
-    """The landmark's parts, and the town's if there is a background."""
-    return toy_landmark(landmark) + TOWN * background
-
-
 def part_sdf(part, x):
     """Signed distance to a part, + and exact outside. (P,3) -> (P,)"""
     x, y, z = (x - part.centre).T
@@ -377,7 +400,8 @@ def gradient(sdf, x, step):
 def toy_sdf(x_world, background=True, landmark=0):
     """Signed distance of the toy, + and exact outside, SfM units. (P,3) -> (P,)"""
     x = (x_world - TOY_ORIGIN) / TOY_SCALE
-    distances = [part_sdf(part, x) for part in toy_parts(landmark, background)]
+    parts = toy_landmark(landmark) + TOWN * background
+    distances = [part_sdf(part, x) for part in parts]
     return np.min(distances, axis=0) * TOY_SCALE
 
 
@@ -497,23 +521,6 @@ def shade(o, d, parts, background, sun, weather):
     return colour
 
 
-def ray_directions(K, c2w, w, h, offset=(0.5, 0.5)):
-    """Unit vectors through each pixel's offset, in world axes, row by row. -> (h*w,3)"""
-    uv = np.indices((w, h)).T.reshape(-1, 2)
-    xy = (uv + offset - K[2:]) / K[:2]
-    d = np.column_stack([xy, np.ones(w * h)])
-    d /= lengths(d)[:, None]
-    return d @ c2w[:, :3].T
-
-
-def project(K, c2w, x):
-    """Pixels (P,2), -1e9 behind the camera, and distances (P,) of points x (P,3)."""
-    p = (x - c2w[:, 3]) @ c2w[:, :3]
-    z = p[:, 2:]
-    uv = p[:, :2] / np.maximum(z, 1 / FAR) * K[:2] + K[2:]
-    return np.where(z > 0, uv, -1e9), lengths(p)
-
-
 def toy_camera(rng, azimuth, size):
     """A tourist's camera at `azimuth` [rad] from the front, in the toy's units.
 
@@ -594,10 +601,9 @@ def toy_points(rng, photos):
     tracks = []
     for (K, c2w, w, h), _, depth, people in photos:
         uv, distance = project(K, c2w, x)
-        pixel = np.clip(uv, 0, (w - 1, h - 1)).astype(int) @ (1, w)
-        is_inside = ((uv >= 0) & (uv < (w, h))).all(1)
+        pixel = pixel_index(uv, (w, h))
         is_visible = abs(depth[pixel] / distance - 1) < 0.02
-        is_visible &= is_inside & ~people[pixel]
+        is_visible &= is_in_photo(uv, (w, h)) & ~people[pixel]
         is_found = rng.random(len(x)) < 0.6
         tracks.append(np.flatnonzero(is_visible & is_found))
     is_wrong = rng.random((len(x), 1)) < 0.015
@@ -648,7 +654,7 @@ def make_toy(seed=0, size=96, photos=48, test=8, occluders=0.05, exposure=1.0,
     share = np.minimum(share / share.sum() * photos * occluders, 0.85)
     turns = np.radians(day.uniform(-sun, sun, count))
     weather = air.uniform(-sky, sky, (count, 4))
-    parts = toy_parts(landmark, background)
+    parts = toy_landmark(landmark) + TOWN * background
     depth, surface, images, occluder = [], [], [], []  # of each photo
     for i in progress(numbers, "drawing photos"):
         _, c2w, w, h = views[i]
@@ -807,7 +813,7 @@ def add_statistics(scene):
         if scene["is_test"][i]:
             continue
         sizes.append(distance[lengths(x) < 1] / K[0])
-        pixel = first + np.clip(uv, 0, wh - 1).astype(int) @ (1, wh[0])
+        pixel = first + pixel_index(uv, wh)
         is_seen = ~masked[pixel]
         observed.append(own[is_seen])
         brightness.append(rgb[pixel[is_seen]].mean(1) / 255)
@@ -1311,7 +1317,7 @@ def read_usable(model, points, rows, held_out, downscale):
         c2w = camera_to_world(pose)
         own = np.array([rows[key] for key in ids if key in rows], int)
         uv, _ = project(K, c2w, points[own, :3])
-        is_inside = ((uv >= 0) & (uv < image.shape[1::-1])).all(1)
+        is_inside = is_in_photo(uv, image.shape[1::-1])
         if len(own) and is_inside.mean() < 0.5:
             misfits[name] = is_inside.mean()
         usable[name] = image, K, c2w, own

@@ -405,7 +405,7 @@ def test_walls_agree_with_the_distance_function():
 
 
 def test_rays_end_on_the_part_they_hit():
-    parts = data_prep.toy_parts(0, True)
+    parts = data_prep.toy_landmark(0) + data_prep.TOWN
     o = np.array([[0, -4.0, 1]])
     d = np.random.default_rng(0).uniform(-1, 1, (999, 3))
     t, which = data_prep.trace(o, d, parts)
@@ -416,7 +416,7 @@ def test_rays_end_on_the_part_they_hit():
 
 
 def test_the_ground_behind_a_tower_is_darker():
-    parts = data_prep.toy_parts(0, True)
+    parts = data_prep.toy_landmark(0) + data_prep.TOWN
     o = np.array([[1.6, 1.1, 5], [.1, -.75, 5]])  # above the ground behind and before it
     d = np.array([[1e-6, 1e-6, -1]] * 2)
     behind, before = data_prep.shade(o, d, parts, True, data_prep.SUN, np.zeros(4)).mean(1)
