@@ -328,17 +328,16 @@ def stretch(rng, parts):
     """The parts, which stand on each other, in other proportions and moved a little."""
     size = rng.uniform(0.7, 1.2, 3)
     shift = np.append(rng.uniform(-0.06, 0.06, 2), 0)
-    centres = np.array([part.centre for part in parts])
-    foot = centres.mean(0)
-    foot[2] = centres[0, 2] - parts[0].half[2]
-    changed = []
-    for part, centre in zip(parts, centres):
+    foot = np.mean([part.centre for part in parts], axis=0)
+    foot[2] = parts[0].centre[2] - parts[0].half[2]
+    stretched = []
+    for part in parts:
         grow = size if part.shape == "box" else size[[2, 2, 2]]  # others stay round
-        changed.append(part._replace(
-            centre=foot + (centre - foot) * size + shift,
+        stretched.append(part._replace(
+            centre=foot + (part.centre - foot) * size + shift,
             half=part.half * grow,
             top=part.widths[1] * grow[0]))
-    return changed
+    return stretched
 
 
 def toy_landmark(number):
@@ -351,13 +350,12 @@ def toy_landmark(number):
     parts = PLINTH + hall
     for group in (TOWER, ANNEX, STATUE):
         parts += stretch(rng, group)
-    side = rng.choice((-1, 1))
-    other = {"gold": "gold"}
+    mirror = np.array([rng.choice((-1, 1)), 1, 1])
+    material = {"gold": "gold"}
     for names in ALIKE:
-        other |= dict(zip(names, rng.permutation(names)))
+        material |= dict(zip(names, rng.permutation(names)))
     return [
-        part._replace(centre=part.centre * np.array([side, 1, 1]),
-                      material=other[part.material])
+        part._replace(centre=part.centre * mirror, material=material[part.material])
         for part in parts
     ]
 
@@ -482,17 +480,16 @@ def texture(name, across, up):
     return colour * brightness[:, None]
 
 
-def paint(part, x):
+def surface_colour(part, x):
     """Colours at points on a part's surface. (P,3) -> (P,3)"""
     x, y, z = x.T
     if part.shape == "ground":
-        is_paved = np.hypot(x, y) < 2.6
-        return np.where(
-            is_paved[:, None], texture("paving", x, y), texture("meadow", x, y))
-    if part.shape == "box":
-        return texture(part.material, x + y, z)
-    turn = np.arctan2(y - part.centre[1], x - part.centre[0])
-    return texture(part.material, turn, z)
+        is_paved = np.hypot(x, y)[:, None] < 2.6
+        return np.where(is_paved, texture("paving", x, y), texture("meadow", x, y))
+    across = x + y
+    if part.shape != "box":
+        across = np.arctan2(y - part.centre[1], x - part.centre[0])
+    return texture(part.material, across, z)
 
 
 def shade(o, d, parts, background, sun, weather):
@@ -511,7 +508,7 @@ def shade(o, d, parts, background, sun, weather):
         part = parts[i]
         own = which[hit] == i
         normal[own] = gradient(lambda x: part_sdf(part, x), x[own], 1e-5)
-        surface[own] = paint(part, x[own])
+        surface[own] = surface_colour(part, x[own])
     in_sun = trace(x + 1e-4 * normal, sun[None], parts)[0] == np.inf
     sunlight = np.maximum(normal @ sun, 0) * in_sun
     light = sunlight[:, None] * (1.15, 1.05, 0.88)
@@ -544,7 +541,7 @@ def toy_camera(rng, azimuth, size):
     return (f, f, w / 2, h / 2), c2w, w, h
 
 
-# A passer-by's strokes: both ends x y and width, in heights above the feet; whose colour.
+# A passer-by's strokes: from x y, to x y, width, in heights above the feet; whose colour.
 STROKES = [
     ((-0.06, 0.03), (-0.06, 0.45), 0.10, "legs"),
     ((0.06, 0.03), (0.06, 0.45), 0.10, "legs"),
@@ -562,48 +559,54 @@ def draw_people(rng, w, h, share):
     canvas = np.zeros((4 * h, 4 * w, 4), np.float32)  # drawn large, then averaged
     left = share
     while left > max(0.1 * share, 0.002):
-        tall = np.sqrt(left * w * h / 0.25) * rng.uniform(0.5, 1)
-        tall = 4 * np.clip(tall, 0.12 * h, 0.95 * h)
-        feet = rng.uniform((0, 3.2 * h), (4 * w, 4 * h + 0.2 * tall))
-        vivid = 0.02 + 0.83 * rng.beta(0.4, 0.4, (4, 3))  # or black, or white
-        coat, legs, thing, skin = vivid
+        height = np.sqrt(left * w * h / 0.25) * rng.uniform(0.5, 1)
+        height = 4 * np.clip(height, 0.12 * h, 0.95 * h)
+        feet = rng.uniform((0, 3.2 * h), (4 * w, 4 * h + 0.2 * height))
+        coat, legs, thing, skin = 0.02 + 0.83 * rng.beta(0.4, 0.4, (4, 3))  # vivid
         skin = (0.3 + skin[:1]) * (0.8, 0.6, 0.45)
         stripe = thing if rng.random() < 0.4 else coat
         colours = dict(coat=coat, legs=legs, thing=thing, skin=skin, stripe=stripe)
-        spot = rng.uniform((-0.25, 0.5), (0.25, 1.15))  # of a bag, balloon or hat
-        end = spot + rng.uniform(-0.15, 0.15, 2)
-        strokes = [*STROKES, (spot, end, rng.uniform(0.08, 0.25), "thing")]
-        for first, last, wide, whose in strokes:
-            ends = feet + np.array([first, last]) * (tall, -tall)
-            first, last = ends.astype(int).tolist()
-            colour = *colours[whose].tolist(), 1
-            cv2.line(canvas, first, last, colour, int(wide * tall) + 1)
+        begin = rng.uniform((-0.25, 0.5), (0.25, 1.15))  # of a bag, balloon or hat
+        end = begin + rng.uniform(-0.15, 0.15, 2)
+        strokes = [*STROKES, (begin, end, rng.uniform(0.08, 0.25), "thing")]
+        for begin, end, width, whose in strokes:
+            ends = feet + np.array([begin, end]) * (height, -height)
+            colour = (*colours[whose].tolist(), 1)
+            cv2.line(canvas, *ends.astype(int), colour, int(width * height) + 1)
         left = share - canvas[..., 3].mean()
     small = cv2.resize(canvas, (w, h), interpolation=cv2.INTER_AREA)
     return small.reshape(-1, 4).astype(float)
 
 
-def toy_points(rng, photos):
-    """Points as by SfM: noisy, 1.5 % of them wrong.
+def draw_photo(rng, linear, exposure):
+    """Pixels (P,3) of 8 bits from linear colours, at random exposure and white balance."""
+    brightness, red, blue, contrast = exposure * rng.uniform(-1, 1, 4)
+    gain = 2 ** (brightness / 2) * np.array([1 + 0.1 * red, 1, 1 + 0.1 * blue])
+    srgb = np.clip(linear * gain, 0, 1) ** (1.2 ** contrast / 2.2)
+    return (srgb * 255 + 0.5).astype(np.uint8)
 
-    photos: of each its view, surface (P,3), depth (P,) and people (P,)
-    -> points (K,5) as in build_scene, and the numbers of those that each photo sees
+
+def toy_points(rng, views, depth, surface, occluder):
+    """Points as by SfM, noisy and 1.5 % of them wrong, from lists with an item a photo.
+
+    views: K, c2w, width, height; depth (P,); surface (P,3); occluder (P,) bool
+    -> points (K,5) and tracks, as in build_scene
     """
-    places = []
-    count = 3000 // len(photos)
-    for _, surface, depth, people in photos:
-        ok = (depth < 30) & ~people
-        is_near = (abs(surface - (0, 0, 1.02)) < (1.3, 1.3, 1)).all(1)  # the landmark
+    samples = []
+    count = 3000 // len(views)
+    for x, t, people in zip(surface, depth, occluder):
+        ok = (t < 30) & ~people
+        is_near = (abs(x - (0, 0, 1.02)) < (1.3, 1.3, 1)).all(1)  # the landmark
         for some, n in [(ok & is_near, count), (ok & ~is_near, count // 5)]:
             if some.any():
-                places.append(surface[rng.choice(np.flatnonzero(some), n)])
-    x = np.concatenate(places)
+                samples.append(x[rng.choice(np.flatnonzero(some), n)])
+    x = np.concatenate(samples)
     tracks = []
-    for (K, c2w, w, h), _, depth, people in photos:
+    for (K, c2w, *wh), t, people in zip(views, depth, occluder):
         uv, distance = project(K, c2w, x)
-        pixel = pixel_index(uv, (w, h))
-        is_visible = abs(depth[pixel] / distance - 1) < 0.02
-        is_visible &= is_in_photo(uv, (w, h)) & ~people[pixel]
+        pixel = pixel_index(uv, wh)
+        is_visible = abs(t[pixel] / distance - 1) < 0.02
+        is_visible &= is_in_photo(uv, wh) & ~people[pixel]
         is_found = rng.random(len(x)) < 0.6
         tracks.append(np.flatnonzero(is_visible & is_found))
     is_wrong = rng.random((len(x), 1)) < 0.015
@@ -634,83 +637,81 @@ def make_toy(seed=0, size=96, photos=48, test=8, occluders=0.05, exposure=1.0,
     sun: its azimuth differs from photo to photo by up to so many degrees
     sky: how much its colour and clouds differ from photo to photo, 0 to 1
     """
-    info = dict(
-        locals(), scene="toy", kind="toy", downscale=1, folder=None, split=None)
-    is_sound = occluders <= 0.6 and exposure <= 2 and sun <= 180 and pose_noise < np.inf
-    is_sound &= min(seed, test, occluders, exposure, pose_noise, landmark, sun, sky) >= 0
-    check(is_sound and sky <= 1 and size >= 16 and photos >= 4,
+    info = dict(locals(), scene="toy", kind="toy", downscale=1, folder=None, split=None)
+    is_sound = (
+        seed >= 0 and size >= 16 and photos >= 4 and test >= 0 and landmark >= 0
+        and 0 <= occluders <= 0.6 and 0 <= exposure <= 2 and 0 <= pose_noise < np.inf
+        and 0 <= sun <= 180 and 0 <= sky <= 1)
+    check(is_sound,
           "occluders in 0..0.6, exposure 0..2, sun 0..180, sky 0..1, size >= 16, "
           "photos >= 4, others >= 0")
     # No knob changes another's random numbers.
-    generators = [np.random.default_rng([seed, k]) for k in range(7)]
-    camera, taste, people, sfm, shake, day, air = generators
+    camera, taste, people, sfm, shake, day, air = [
+        np.random.default_rng([seed, k]) for k in range(7)]
     count = photos + test
     numbers = np.arange(count)
-    angles = 200 * (numbers + camera.uniform(0.1, 0.9, count)) / count - 100
-    views = [toy_camera(camera, angle, size) for angle in np.radians(angles)]
     is_test = np.isin(numbers, (np.arange(test) + 0.5) * count // test)
+    azimuth = 200 * (numbers + camera.uniform(0.1, 0.9, count)) / count - 100
     share = people.gamma(0.8 + 6 * occluders, size=count)  # some photos stay free
     share = share * ~is_test
     share = np.minimum(share / share.sum() * photos * occluders, 0.85)
-    turns = np.radians(day.uniform(-sun, sun, count))
+    turn = np.radians(day.uniform(-sun, sun, count))  # of the sun
     weather = air.uniform(-sky, sky, (count, 4))
     parts = toy_landmark(landmark) + TOWN * background
-    depth, surface, images, occluder = [], [], [], []  # of each photo
+    views, images, depth, surface, occluder = [], [], [], [], []  # of each photo
     for i in progress(numbers, "drawing photos"):
-        _, c2w, w, h = views[i]
+        view = toy_camera(camera, np.radians(azimuth[i]), size)
+        _, c2w, w, h = view
         o = c2w[None, :, 3]
-        to_sun = cv2.Rodrigues((0, 0, turns[i]))[0] @ SUN
-        linear = 0
+        to_sun = cv2.Rodrigues((0, 0, turn[i]))[0] @ SUN
+        samples = []
         for offset in itertools.product((0.25, 0.75), repeat=2):  # places in a pixel
-            d = ray_directions(*views[i], offset)
+            d = ray_directions(*view, offset)
             colour = shade(o, d, parts, background, to_sun, weather[i])
-            linear = linear + np.clip(colour, 0, 1) / 4
+            samples.append(np.clip(colour, 0, 1))
         cover = draw_people(people, w, h, share[i])
-        linear = linear * (1 - cover[:, 3:]) + cover[:, :3]  # (h*w,3)
-        brightness, red, blue, contrast = exposure * taste.uniform(-1, 1, 4)
-        gain = 2 ** (brightness / 2) * np.array([1 + 0.1 * red, 1, 1 + 0.1 * blue])
-        srgb = np.clip(linear * gain, 0, 1) ** (1.2 ** contrast / 2.2)
-        images.append((srgb * 255 + 0.5).astype(np.uint8).reshape(h, w, 3))
-        d = ray_directions(*views[i])
+        linear = np.mean(samples, axis=0) * (1 - cover[:, 3:]) + cover[:, :3]  # (h*w,3)
+        d = ray_directions(*view)
         t, _ = trace(o, d, parts)
+        views.append(view)
+        images.append(draw_photo(taste, linear, exposure).reshape(h, w, 3))
         depth.append(t)
         surface.append(o + t[:, None] * d)
         occluder.append(cover[:, 3] > 0)
-    points, tracks = toy_points(sfm, list(zip(views, surface, depth, occluder)))
-    for (K, c2w, _, _), held_out in zip(views, is_test):
-        shake_camera(shake, K, c2w, pose_noise * (not held_out))
-        c2w[:, 3] = c2w[:, 3] * TOY_SCALE + TOY_ORIGIN
+    points, tracks = toy_points(sfm, views, depth, surface, occluder)
+    K, c2w, _, _ = zip(*views)
+    for i in numbers:
+        shake_camera(shake, K[i], c2w[i], pose_noise * (not is_test[i]))
+        c2w[i][:, 3] = c2w[i][:, 3] * TOY_SCALE + TOY_ORIGIN
     signs = np.array(list(itertools.product((-1, 1), repeat=3)))
     corners = [part.centre + part.half * signs for part in toy_landmark(landmark)]
-    K, c2w, _, _ = zip(*views)
     scene = build_scene(
         images, K, c2w, is_test, [f"toy_{i:03d}.png" for i in numbers], points, tracks,
         info, contain=np.array(corners) * TOY_SCALE + TOY_ORIGIN)
     depth = np.concatenate(depth) * TOY_SCALE / scene["scale"]
     scene["depth"] = depth.astype(np.float16)
     scene["occluder"] = np.concatenate(occluder)
-    walls = np.concatenate(surface)[::9] * TOY_SCALE + TOY_ORIGIN
-    walls = (walls - scene["center"]) / scene["scale"]
-    walls = walls[lengths(walls) < 0.95]
-    return scene | toy_walls(scene, walls, background, landmark)
+    return scene | toy_walls(scene, np.concatenate(surface)[::9], background, landmark)
 
 
-def toy_walls(scene, wall, background, landmark):
-    """The arrays of TOY_FORMAT about surfaces, from visible points wall (P,3)."""
+def toy_walls(scene, surface, background, landmark):
+    """The arrays of OPTIONAL about surfaces, from visible points (P,3) in the toy's units."""
     def sdf(x):  # (P,3) -> (P,), scene units
         world = x * scene["scale"] + scene["center"]
         return toy_sdf(world, background, landmark) / scene["scale"]
 
+    wall = (surface * TOY_SCALE + TOY_ORIGIN - scene["center"]) / scene["scale"]
+    wall = wall[lengths(wall) < 0.95]
     normal = gradient(sdf, wall, 0.004)
     is_smooth = abs(lengths(normal) - 1) < 0.01
     near = wall + np.random.default_rng(0).normal(0, 0.02, wall.shape)
-    s = sdf(near)
-    is_near = abs(s) < 0.05
+    distance = sdf(near)
+    is_near = abs(distance) < 0.05
     return dict(
         wall=wall[is_smooth],
         wall_normal=normal[is_smooth],
         near_wall=near[is_near],
-        near_wall_sdf=s[is_near])
+        near_wall_sdf=distance[is_near])
 
 
 # ---- from photos, poses and points to a scene ------------------------------------------
