@@ -518,6 +518,17 @@ def shade(o, d, parts, background, sun, weather):
     return colour
 
 
+def render(view, parts, background, sun, weather):
+    """Linear colours of a photo, the mean of four rays a pixel. -> (h*w,3) in 0..1"""
+    _, c2w, _, _ = view
+    samples = []
+    for offset in itertools.product((0.25, 0.75), repeat=2):  # places in a pixel
+        d = ray_directions(*view, offset)
+        colour = shade(c2w[None, :, 3], d, parts, background, sun, weather)
+        samples.append(np.clip(colour, 0, 1))
+    return np.mean(samples, axis=0)
+
+
 def toy_camera(rng, azimuth, size):
     """A tourist's camera at `azimuth` [rad] from the front, in the toy's units.
 
@@ -578,8 +589,8 @@ def draw_people(rng, w, h, share):
     return small.reshape(-1, 4).astype(float)
 
 
-def draw_photo(rng, linear, exposure):
-    """Pixels (P,3) of 8 bits from linear colours, at random exposure and white balance."""
+def develop(rng, linear, exposure):
+    """With a random exposure, white balance and contrast. linear (P,3) -> uint8 (P,3)"""
     brightness, red, blue, contrast = exposure * rng.uniform(-1, 1, 4)
     gain = 2 ** (brightness / 2) * np.array([1 + 0.1 * red, 1, 1 + 0.1 * blue])
     srgb = np.clip(linear * gain, 0, 1) ** (1.2 ** contrast / 2.2)
@@ -662,21 +673,16 @@ def make_toy(seed=0, size=96, photos=48, test=8, occluders=0.05, exposure=1.0,
     for i in progress(numbers, "drawing photos"):
         view = toy_camera(camera, np.radians(azimuth[i]), size)
         _, c2w, w, h = view
-        o = c2w[None, :, 3]
         to_sun = cv2.Rodrigues((0, 0, turn[i]))[0] @ SUN
-        samples = []
-        for offset in itertools.product((0.25, 0.75), repeat=2):  # places in a pixel
-            d = ray_directions(*view, offset)
-            colour = shade(o, d, parts, background, to_sun, weather[i])
-            samples.append(np.clip(colour, 0, 1))
+        linear = render(view, parts, background, to_sun, weather[i])
         cover = draw_people(people, w, h, share[i])
-        linear = np.mean(samples, axis=0) * (1 - cover[:, 3:]) + cover[:, :3]  # (h*w,3)
+        linear = linear * (1 - cover[:, 3:]) + cover[:, :3]
         d = ray_directions(*view)
-        t, _ = trace(o, d, parts)
+        t, _ = trace(c2w[None, :, 3], d, parts)
         views.append(view)
-        images.append(draw_photo(taste, linear, exposure).reshape(h, w, 3))
+        images.append(develop(taste, linear, exposure).reshape(h, w, 3))
         depth.append(t)
-        surface.append(o + t[:, None] * d)
+        surface.append(c2w[:, 3] + t[:, None] * d)
         occluder.append(cover[:, 3] > 0)
     points, tracks = toy_points(sfm, views, depth, surface, occluder)
     K, c2w, _, _ = zip(*views)
