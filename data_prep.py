@@ -130,22 +130,22 @@ def progress(items, what):
 
 def atomic_write(path, write):
     """write(temporary path), then rename: `path` is the whole old file or the new one."""
-    part = path.with_name(f".{path.stem}.{os.getpid()}.{time.time_ns()}{path.suffix}")
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}.{time.time_ns()}{path.suffix}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        result = write(part)
+        result = write(temporary)
         check(result is not False, f"cannot encode {path}")  # so cv2.imwrite says no
-        part.replace(path)
+        temporary.replace(path)
     except OSError as e:
         says = f"cannot write {path} ({e.strerror or e}): free or choose a place"
         raise UserError(says) from e
     finally:
-        part.unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
 
 
 def write_scene(path, scene):
     """Not compressed: a third larger, but six times faster to write."""
-    atomic_write(path, lambda part: np.savez(part, **scene))
+    atomic_write(path, lambda temporary: np.savez(temporary, **scene))
 
 
 def refuse_bomb(path):
@@ -199,7 +199,7 @@ def read_scene(path):
 
 # ---- pixels and rays -------------------------------------------------------------------
 def lengths(x):
-    """Of vectors (P,3) -> (P,)"""
+    """Lengths of vectors. (P,3) -> (P,)"""
     return np.linalg.norm(x, axis=1)
 
 
@@ -390,9 +390,9 @@ def part_sdf(part, x):
 
 
 def gradient(sdf, x, step):
-    """Of a distance function, by central differences at x (P,3). -> (P,3)"""
-    ends = [sdf(x + axis) - sdf(x - axis) for axis in step * np.eye(3)]
-    return np.stack(ends, 1) / (2 * step)
+    """Gradient of a distance function at x (P,3), by central differences. -> (P,3)"""
+    rise = [sdf(x + axis) - sdf(x - axis) for axis in step * np.eye(3)]
+    return np.stack(rise, axis=1) / (2 * step)
 
 
 def toy_sdf(x_world, background=True, landmark=0):
@@ -403,8 +403,8 @@ def toy_sdf(x_world, background=True, landmark=0):
     return np.min(distances, axis=0) * TOY_SCALE
 
 
-def enter_part(part, o, d):
-    """Where rays o, d (R,3) enter a part; inf for a miss. -> (R,)
+def intersect_part(part, o, d):
+    """Distances at which rays o, d (R,3) enter a part; inf for a miss. -> (R,)
 
     A part is where a quadric and up to two slabs overlap. The quadric is round in the
     first n coordinates, and its radius is linear in z: a roof has n = 1 and two slabs,
@@ -442,7 +442,7 @@ def trace(o, d, parts):
 
     -> distance (R,), inf is sky, and number of the part (R,)
     """
-    enter = np.stack([enter_part(part, o, d) for part in parts])
+    enter = np.stack([intersect_part(part, o, d) for part in parts])
     return enter.min(0), enter.argmin(0)
 
 
@@ -797,6 +797,28 @@ def build_scene(
     return add_statistics(scene)
 
 
+def brightness_spread(points, brightness):
+    """Deviation of photos' brightness at equal points. Lists of (M,), an item a photo."""
+    all_points = np.concatenate(points)
+    mean = np.bincount(all_points, np.concatenate(brightness))
+    mean /= np.maximum(np.bincount(all_points), 1)  # (K,)
+    offsets = []
+    for own, b in zip(points, brightness):
+        if len(own):
+            offsets.append(np.median(b - mean[own]))
+    return np.std(offsets) if offsets else np.float64(0)
+
+
+def common_color(colors):
+    """Median of colours uint8 (P,3) in 0..1; NaN unless 60 % are like it. -> (3,)"""
+    if len(colors) > 100:  # fewer may all be people
+        median = np.median(colors, axis=0)
+        is_like = (abs(colors - median) < 5.1).all(1)
+        if is_like.mean() > 0.6:
+            return median / 255
+    return np.full(3, np.nan)
+
+
 def add_statistics(scene):
     """Adds the arrays of FORMAT that geonvs.py decides by.
 
@@ -808,14 +830,14 @@ def add_statistics(scene):
     rgb = scene["rgb"]
     masked = scene.get("masked", np.zeros(len(rgb), bool))
     step = max(1, len(rgb) // 500_000)
-    near, places = [], []  # of all photos
+    near, track_uv = [], []  # of all photos
     observed, sizes, brightness, background = [], [], [], []  # of the training photos
     photos = zip(scene["start"], scene["K"], scene["c2w"], scene["wh"])
     for i, (first, K, c2w, wh) in enumerate(photos):
         own = scene["track_point"][scene["track_photo"] == i]
         x = scene["points"][own]
         uv, distance = project(K, c2w, x)
-        places.append(np.clip(uv / wh, -1, 2))
+        track_uv.append(np.clip(uv / wh, -1, 2))
         near.append(max(0.8 * np.quantile(distance, 0.02), 0.02) if len(own) else 0.05)
         if scene["is_test"][i]:
             continue
@@ -830,24 +852,12 @@ def add_statistics(scene):
         is_miss = lengths(closest) > 1
         is_miss &= ~masked[first:first + len(d)]
         background.append(rgb[first + np.flatnonzero(is_miss)[::step]])
-    points = np.concatenate(observed)
-    mean = np.bincount(points, np.concatenate(brightness))
-    mean /= np.maximum(np.bincount(points), 1)  # (K,)
-    offsets = [
-        np.median(b - mean[own]) for b, own in zip(brightness, observed) if len(own)]
-    background = np.concatenate(background)
-    color = np.full(3, np.nan)
-    if len(background) > 100:  # fewer may all be people
-        typical = np.median(background, 0)
-        agree = (abs(background - typical) < 5.1).all(1)
-        if agree.mean() > 0.6:
-            color = typical / 255
     return scene | dict(
         near=np.float32(near),
-        track_uv=np.concatenate(places, dtype=np.float32),
+        track_uv=np.concatenate(track_uv, dtype=np.float32),
         footprint=np.quantile(np.concatenate(sizes), 0.25),
-        exposure_spread=np.std(offsets) if offsets else np.float64(0),
-        bg_color=color)
+        exposure_spread=brightness_spread(observed, brightness),
+        bg_color=common_color(np.concatenate(background)))
 
 
 # ---- folders with photos, masks and COLMAP models --------------------------------------
@@ -905,10 +915,10 @@ def read_cameras(sparse):
         check(0 <= kind < len(CAMERA_MODELS),
               f"{sparse} has camera model {kind}, which is unknown: run "
               "colmap image_undistorter")
-        kind, names = list(CAMERA_MODELS.items())[kind]
+        model, names = list(CAMERA_MODELS.items())[kind]
         names = names.split()
         value = dict(zip(names, read(f"{len(names)}d")))
-        if kind in PERSPECTIVE:
+        if model in PERSPECTIVE:
             f = value.get("f")
             K = [value.get("fx", f), value.get("fy", f), value["cx"], value["cy"]]
             distortion = [value.get(name, 0.0) for name in OPENCV_DISTORTION]
@@ -984,7 +994,10 @@ def files_below(folder, levels=7):
         for path in sorted(folder.iterdir()):
             if path.name.startswith((".", "@")):  # NAS boxes write @eaDir
                 continue
-            files += files_below(path, levels - 1) if path.is_dir() else [path]
+            if path.is_dir():
+                files += files_below(path, levels - 1)
+            else:
+                files.append(path)
     return files
 
 
@@ -1017,24 +1030,27 @@ def mask_files(images, names):
     return masks
 
 
-def match_names(wanted, there):
-    """{wanted name: its name there}: equal, or else equal but for case and Unicode form.
+def plain_name(name):
+    """The same for names that differ in case or Unicode form only."""
+    folded = unicodedata.normalize("NFC", name).casefold()
+    return unicodedata.normalize("NFC", folded)
 
-    The latter only if no second name is alike.
-    """
+
+def match_names(wanted, there):
+    """{wanted name: its name there}: equal, or of equal plain_name if only one has it."""
     found = {name: name for name in wanted if name in there}
-    alike = defaultdict(lambda: ([], []))
-    for side, names in enumerate([set(wanted) - found.keys(), set(there) - found.keys()]):
-        for name in names:
-            plain = unicodedata.normalize("NFC", name).casefold()
-            alike[unicodedata.normalize("NFC", plain)][side].append(name)
-    for ours, theirs in alike.values():
-        if len(ours) == len(theirs) == 1:
-            found[ours[0]] = theirs[0]
+    ours, theirs = defaultdict(list), defaultdict(list)  # plain name: names
+    for name in set(wanted) - found.keys():
+        ours[plain_name(name)].append(name)
+    for name in set(there) - found.keys():
+        theirs[plain_name(name)].append(name)
+    for plain in ours.keys() & theirs.keys():
+        if len(ours[plain]) == 1 and len(theirs[plain]) == 1:
+            found[ours[plain][0]] = theirs[plain][0]
     return found
 
 
-def nearest(name, names):
+def name_hint(name, names):
     """A hint at the name that may be meant, or nothing."""
     stem = PurePosixPath(name).stem
     close = [other for other in names if PurePosixPath(other).stem == stem]
@@ -1084,7 +1100,7 @@ def find_model(folder, command):
           f"python data_prep.py {command}")
     lost = sorted(best.photos.keys() - best.files)
     if lost:
-        hint = nearest(lost[0], best.on_disk)
+        hint = name_hint(lost[0], best.on_disk)
         says = f"{len(lost)} photos of {best.sparse} are not on disk, such as {lost[0]!r}{hint}"
         check(best.files,
               f"{says}: put them into {folder / 'images'}, or run "
@@ -1122,8 +1138,8 @@ def split_files(folder, split):
     if tables and tables[0].suffix == ".txt":
         name = tables[0].name
         tables = [
-            tables[0].with_name(re.sub("train|test", part, name))
-            for part in ("train", "test")
+            tables[0].with_name(re.sub("train|test", subset, name))
+            for subset in ("train", "test")
         ]
     return tables
 
@@ -1135,31 +1151,30 @@ def read_split(tables):
     """
     path = tables[0]
     if len(tables) == 2:
-        head = ["filename", "split"]
         rows = [
-            (name, part)
-            for part, path in zip(("train", "test"), tables)
-            for name, *_ in read_table(path)
+            dict(filename=words[0], split=subset)
+            for subset, names in zip(("train", "test"), tables)
+            for words in read_table(names)
         ]
     else:
-        head, *rows = read_table(path)
-    check({"filename", "split"} <= set(head),
-          f"{path} needs a header with filename and split")
+        head, *lines = read_table(path)
+        check("filename" in head and "split" in head,
+              f"{path} needs a header with filename and split")
+        rows = [dict(zip(head, words)) for words in lines]
     held_out = {}
-    for words in rows:
-        row = dict(zip(head, words))
+    for row in rows:
         if row.get("id") == "":
             continue
         name = row.get("filename")
-        part = row.get("split")
-        is_test = part == "test"
-        check(name and part in ("train", "test") and held_out.get(name, is_test) == is_test,
-              f"{path}: {name!r} is {part!r}; each is train or test, and not both")
+        subset = row.get("split")
+        is_test = subset == "test"
+        check(name and subset in ("train", "test") and held_out.get(name, is_test) == is_test,
+              f"{path}: {name!r} is {subset!r}; each is train or test, and not both")
         held_out[name] = is_test
     return held_out
 
 
-def choose_parts(folder, names, tables):
+def choose_held_out(folder, names, tables):
     """{name: whether it is held out} of the photos that are to be used; tells the rule."""
     if not tables:
         print(f"{folder} has no split file: every eighth photo is held out")
@@ -1167,7 +1182,7 @@ def choose_parts(folder, names, tables):
     print(f"split by {tables[0]}")
     held_out = read_split(tables)
     matches = match_names(held_out, names)
-    held_out = {matches.get(name, name): part for name, part in held_out.items()}
+    held_out = {matches.get(name, name): is_test for name, is_test in held_out.items()}
     rest = set(names) - held_out.keys()
     if rest:
         warn(f"{len(rest)} photos are not in {tables[0]}: {min(rest)} ...")
@@ -1217,6 +1232,15 @@ def is_heic(path):
     return head[4:8] == b"ftyp" and head[8:] in (b"heic", b"heix", b"mif1", b"msf1")
 
 
+def is_cut_off(data):
+    """Whether a JPEG or PNG file lacks its end. OpenCV does not tell."""
+    if data[1:4] == b"PNG":
+        return b"IEND" not in data
+    last_scan = data.rfind(b"\xff\xda")
+    end_mark = data.rfind(b"\xff\xd9")
+    return data[:2] == b"\xff\xd8" and end_mark < last_scan
+
+
 def decode(data, flags):
     """Image of OpenCV; None unless it is one."""
     try:
@@ -1244,11 +1268,7 @@ def read_photo(path, camera, downscale):
     check(path.is_file(), "is a broken link: copy the photo itself")
     check(not is_heic(path), "is HEIC, which cannot be read: convert it to JPEG")
     data = path.read_bytes()
-    # OpenCV is silent where a file is cut off. A JPEG has an end mark after its last scan.
-    is_cut_jpeg = (
-        data[:2] == b"\xff\xd8" and data.rfind(b"\xff\xd9") < data.rfind(b"\xff\xda"))
-    is_cut_png = data[1:4] == b"PNG" and b"IEND" not in data
-    check(not is_cut_jpeg and not is_cut_png, "is cut off: copy it again")
+    check(not is_cut_off(data), "is cut off: copy it again")
     image = decode(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     check(image is not None,
           "is empty, damaged, too large or no photo of a known type: replace it")
@@ -1313,8 +1333,8 @@ def read_usable(model, points, rows, held_out, downscale):
     misfits = {}  # photos that miss most of the points that they should see
     for name in progress(sorted(held_out), "preparing photos"):
         try:
-            check(name in model.photos, f"has no pose{nearest(name, model.files)}")
-            check(name in model.files, f"is not on disk{nearest(name, model.on_disk)}")
+            check(name in model.photos, f"has no pose{name_hint(name, model.files)}")
+            check(name in model.files, f"is not on disk{name_hint(name, model.on_disk)}")
             camera, pose, ids = model.photos[name]
             check_photo(camera, pose, held_out[name])
             image, K = read_photo(model.files[name], camera, downscale)
@@ -1365,7 +1385,7 @@ def prepare(name, downscale=2, split=None):
         split=split)
     info["files"] = fingerprint(info)
     tables = split_files(folder, split)
-    held_out = choose_parts(folder, sorted(model.files), tables)
+    held_out = choose_held_out(folder, sorted(model.files), tables)
     points, rows = read_points(model.sparse)
     usable = read_usable(model, points, rows, held_out, downscale)
     masks = read_masks(model, usable)
@@ -1429,11 +1449,11 @@ def fetch(folder_url, path):
     if path.exists():
         return
     url = folder_url + path.name
-    part = path.with_name(path.name + ".part")
+    partial = path.with_name(path.name + ".part")
     try:
         path.parent.mkdir(exist_ok=True)
-        with open(part, "ab") as file:
-            have = max(file.tell() - 1, 0)  # the last byte again: also of a whole part
+        with open(partial, "ab") as file:
+            have = max(file.tell() - 1, 0)  # the last byte again: also of a whole file
             request = Request(url, headers={"Range": f"bytes={have}-"})
             with urlopen(request, timeout=60) as answer:
                 if answer.status != 206:
@@ -1443,10 +1463,10 @@ def fetch(folder_url, path):
                 for _ in progress(range(have, total, 1 << 20), f"MiB of {path.name}"):
                     have += file.write(answer.read(1 << 20))
         check(have == total, "it ended early")
-        part.replace(path)
+        partial.replace(path)
     except Exception as e:  # of the disk, the network or its protocol
         if getattr(e, "code", 0) == 416:  # longer than the file itself
-            part.unlink()
+            partial.unlink()
         says = f"the download of {url} broke ({e}); the same command continues it"
         raise UserError(says) from e
 
@@ -1464,19 +1484,19 @@ def unpack(archive, wanted, folder):
 def download(name):
     """Photos and reconstruction of one of SCENES, with its split file -> data/<name>/"""
     check(name in SCENES, f"--download knows {', '.join(SCENES)}, not {name}")
-    scene, table = SCENES[name]
-    home = DATA / name
-    table = DATA / table
-    archive = DATA / f"{scene}.tar.gz"
-    check(not home.exists(), f"{home} is there already: move it, or leave --download out")
-    fetch(SPLIT_URL, table)
+    inner, split = SCENES[name]
+    folder = DATA / name
+    split = DATA / split
+    archive = DATA / f"{inner}.tar.gz"
+    check(not folder.exists(), f"{folder} is there already: move it, or leave --download out")
+    fetch(SPLIT_URL, split)
     fetch(ARCHIVE_URL, archive)
     try:
         with tempfile.TemporaryDirectory(dir=DATA) as temporary:
-            unpack(archive, (f"{scene}/dense/images/", f"{scene}/dense/sparse/"), temporary)
-            place = Path(temporary) / scene
-            shutil.copy(table, place / table.name)
-            place.replace(home)
+            unpack(archive, (f"{inner}/dense/images/", f"{inner}/dense/sparse/"), temporary)
+            unpacked = Path(temporary) / inner
+            shutil.copy(split, unpacked / split.name)
+            unpacked.replace(folder)
     except Exception as e:  # a damaged archive can fail in any layer
         says = f"cannot unpack {archive} ({e}): free space, or delete it and retry"
         raise UserError(says) from e
@@ -1485,9 +1505,10 @@ def download(name):
 def sfm_photos(images):
     """{name: path} of raw photos, all of which pycolmap can read."""
     files = photo_files(images)
-    for name in [name for name, path in files.items() if not path.is_file()]:
-        warn(f"left out: {name} is a broken link")
-        del files[name]
+    for name, path in list(files.items()):
+        if not path.is_file():
+            warn(f"left out: {name} is a broken link")
+            del files[name]
     check(files, f"{images} has no photos: name the folder that holds them")
     heic = [name for name, path in files.items() if is_heic(path)]
     check(not heic,
@@ -1578,10 +1599,10 @@ def main(argv=None):
     add("--split", help="default: a .tsv, .csv or train_list.txt in it, or every 8th photo")
     knobs = inspect.signature(make_toy).parameters
     for key, knob in knobs.items():
-        how = {"type": type(knob.default)}
+        options = {"type": type(knob.default)}
         if isinstance(knob.default, bool):
-            how = {"action": argparse.BooleanOptionalAction}
-        add(f"--{key}", help=f"toy, default {knob.default}", **how)
+            options = {"action": argparse.BooleanOptionalAction}
+        add(f"--{key}", help=f"toy, default {knob.default}", **options)
     allow_any_character()
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C
     given = vars(parser.parse_args(argv))
