@@ -258,7 +258,8 @@ MATERIALS = dict(
     paving=Material((0.48, 0.42, 0.34), (0.42, 0.42), 0.2),
     meadow=Material((0.17, 0.22, 0.08), (0.6, 0.6), 0.1),
 )
-ALIKE = [("stone", "pale"), ("sand", "brick"), ("tiles", "slate", "copper")]
+# Other landmarks may swap materials within a group.
+INTERCHANGEABLE = [("stone", "pale"), ("sand", "brick"), ("tiles", "slate", "copper")]
 
 
 class Part(NamedTuple):
@@ -279,11 +280,11 @@ PLINTH = [
     Part("box", centre=(-.01, -.03, .05), half=(.96, .53, .05), material="stone"),
     Part("box", centre=(-.05, 0, .15), half=(.85, .47, .05), material="stone"),
 ]
-HALL = [
+COLUMNS = [
     Part("column", centre=(x, -.34, .47), half=(.062, .062, .27), top=.05, material="pale")
     for x in np.linspace(-.54, .60, 6)
 ]
-HALL += [
+HALL = COLUMNS + [
     Part("box", centre=(.03, .2, .53), half=(.59, .26, .33), material="sand"),
     Part("box", centre=(.03, .03, .8), half=(.67, .46, .06), material="pale"),
     Part("box", centre=(.03, .03, .98), half=(.71, .48, .12), top=0, material="tiles"),
@@ -325,7 +326,7 @@ for x, y, wide, tall in HOUSES:
 
 
 def stretch(rng, parts):
-    """The parts, which stand on each other, in other proportions and moved a little."""
+    """Parts that stand on each other, in random proportions and moved a little."""
     size = rng.uniform(0.7, 1.2, 3)
     shift = np.append(rng.uniform(-0.06, 0.06, 2), 0)
     foot = np.mean([part.centre for part in parts], axis=0)
@@ -341,18 +342,18 @@ def stretch(rng, parts):
 
 
 def toy_landmark(number):
-    """The parts of the landmark; for other numbers than 0 it is another building."""
+    """The parts of a landmark; every number is another building."""
     if number == 0:
         return PLINTH + HALL + DOME + TOWER + ANNEX + STATUE
     rng = np.random.default_rng([number, 1])
     hall = stretch(rng, HALL + DOME)
-    hall[len(HALL):] = stretch(rng, hall[len(HALL):])
-    parts = PLINTH + hall
+    dome = stretch(rng, hall[len(HALL):])  # once more
+    parts = PLINTH + hall[:len(HALL)] + dome
     for group in (TOWER, ANNEX, STATUE):
         parts += stretch(rng, group)
     mirror = np.array([rng.choice((-1, 1)), 1, 1])
     material = {"gold": "gold"}
-    for names in ALIKE:
+    for names in INTERCHANGEABLE:
         material |= dict(zip(names, rng.permutation(names)))
     return [
         part._replace(centre=part.centre * mirror, material=material[part.material])
@@ -367,7 +368,7 @@ def part_sdf(part, x):
         return z
     if part.shape == "ball":
         return np.hypot(np.hypot(x, y), z) - part.half[0]
-    # First in the plane of u, across, and z: the slanted side, then bottom and top.
+    # In the plane of u, outwards, and z: distance d to the slanted side, bottom and top.
     u = abs(x) if part.shape == "box" else np.hypot(x, y)
     bottom, top = part.widths
     _, depth, half = part.half
@@ -396,7 +397,7 @@ def gradient(sdf, x, step):
 
 
 def toy_sdf(x_world, background=True, landmark=0):
-    """Signed distance of the toy, + and exact outside, SfM units. (P,3) -> (P,)"""
+    """Signed distance to the toy, + and exact outside, SfM units. (P,3) -> (P,)"""
     x = (x_world - TOY_ORIGIN) / TOY_SCALE
     parts = toy_landmark(landmark) + TOWN * background
     distances = [part_sdf(part, x) for part in parts]
@@ -454,13 +455,13 @@ def sky_colour(d, weather):
     cloud = np.sin(5 * azimuth + 9 * wind) * np.sin(12 * up + 7 * wind)
     colour = (0.58, 0.68, 0.78) - np.clip(up * 1.5, 0, 1) * (0.52, 0.46, 0.26)
     colour = colour + 0.4 * np.array(tint) + 0.5 * abs(wind) * np.maximum(cloud, 0)
-    for slope, swing, waves, hill in [
+    for height, amplitude, waves, hill in [
         (0.11, 0.045, 5, (0.25, 0.33, 0.45)),
         (0.06, 0.03, 9, (0.11, 0.18, 0.16)),
     ]:
-        ridge = np.sin(waves * azimuth + slope * 40)
+        ridge = np.sin(waves * azimuth + height * 40)
         ridge = ridge + 0.6 * np.sin(2.3 * waves * azimuth)
-        colour = np.where(up < slope + swing * ridge, hill, colour)
+        colour = np.where(up < height + amplitude * ridge, hill, colour)
     return colour
 
 
@@ -552,7 +553,7 @@ def toy_camera(rng, azimuth, size):
     return (f, f, w / 2, h / 2), c2w, w, h
 
 
-# A passer-by's strokes: from x y, to x y, width, in heights above the feet; whose colour.
+# The strokes of a passer-by: from x y, to x y, width, in heights above the feet; colour.
 STROKES = [
     ((-0.06, 0.03), (-0.06, 0.45), 0.10, "legs"),
     ((0.06, 0.03), (0.06, 0.45), 0.10, "legs"),
@@ -573,17 +574,18 @@ def draw_people(rng, w, h, share):
         height = np.sqrt(left * w * h / 0.25) * rng.uniform(0.5, 1)
         height = 4 * np.clip(height, 0.12 * h, 0.95 * h)
         feet = rng.uniform((0, 3.2 * h), (4 * w, 4 * h + 0.2 * height))
-        coat, legs, thing, skin = 0.02 + 0.83 * rng.beta(0.4, 0.4, (4, 3))  # vivid
+        # Most colours are vivid, black or white.
+        coat, legs, thing, skin = 0.02 + 0.83 * rng.beta(0.4, 0.4, (4, 3))
         skin = (0.3 + skin[:1]) * (0.8, 0.6, 0.45)
         stripe = thing if rng.random() < 0.4 else coat
         colours = dict(coat=coat, legs=legs, thing=thing, skin=skin, stripe=stripe)
         begin = rng.uniform((-0.25, 0.5), (0.25, 1.15))  # of a bag, balloon or hat
         end = begin + rng.uniform(-0.15, 0.15, 2)
         strokes = [*STROKES, (begin, end, rng.uniform(0.08, 0.25), "thing")]
-        for begin, end, width, whose in strokes:
+        for begin, end, width, colour in strokes:
             ends = feet + np.array([begin, end]) * (height, -height)
-            colour = (*colours[whose].tolist(), 1)
-            cv2.line(canvas, *ends.astype(int), colour, int(width * height) + 1)
+            rgba = (*colours[colour].tolist(), 1)
+            cv2.line(canvas, *ends.astype(int), rgba, int(width * height) + 1)
         left = share - canvas[..., 3].mean()
     small = cv2.resize(canvas, (w, h), interpolation=cv2.INTER_AREA)
     return small.reshape(-1, 4).astype(float)
@@ -628,8 +630,8 @@ def toy_points(rng, views, depth, surface, occluder):
     return np.column_stack([x * TOY_SCALE + TOY_ORIGIN, error, views]), tracks
 
 
-def shake_camera(rng, K, c2w, pixels):
-    """Moves c2w, in the toy's units, by noise of `pixels` rms at the landmark."""
+def add_pose_noise(rng, K, c2w, pixels):
+    """Turns and moves c2w, in the toy's units, by `pixels` rms at the landmark."""
     *turn, dx, dy = rng.normal(0, pixels / 2, 4) / K[0]  # [rad]: turned, and moved
     c2w[:, 3] += c2w[:, :2] @ (dx, dy) * np.linalg.norm(c2w[:, 3])
     c2w[:, :3] @= cv2.Rodrigues((*turn, 0))[0]
@@ -656,38 +658,38 @@ def make_toy(seed=0, size=96, photos=48, test=8, occluders=0.05, exposure=1.0,
     check(is_sound,
           "occluders in 0..0.6, exposure 0..2, sun 0..180, sky 0..1, size >= 16, "
           "photos >= 4, others >= 0")
+    generators = [np.random.default_rng([seed, k]) for k in range(7)]
     # No knob changes another's random numbers.
-    camera, taste, people, sfm, shake, day, air = [
-        np.random.default_rng([seed, k]) for k in range(7)]
+    camera_rng, exposure_rng, people_rng, sfm_rng, pose_rng, sun_rng, sky_rng = generators
     count = photos + test
     numbers = np.arange(count)
     is_test = np.isin(numbers, (np.arange(test) + 0.5) * count // test)
-    azimuth = 200 * (numbers + camera.uniform(0.1, 0.9, count)) / count - 100
-    share = people.gamma(0.8 + 6 * occluders, size=count)  # some photos stay free
+    azimuth = 200 * (numbers + camera_rng.uniform(0.1, 0.9, count)) / count - 100
+    share = people_rng.gamma(0.8 + 6 * occluders, size=count)  # some photos stay free
     share = share * ~is_test
     share = np.minimum(share / share.sum() * photos * occluders, 0.85)
-    turn = np.radians(day.uniform(-sun, sun, count))  # of the sun
-    weather = air.uniform(-sky, sky, (count, 4))
+    turn = np.radians(sun_rng.uniform(-sun, sun, count))  # of the sun
+    weather = sky_rng.uniform(-sky, sky, (count, 4))
     parts = toy_landmark(landmark) + TOWN * background
     views, images, depth, surface, occluder = [], [], [], [], []  # of each photo
     for i in progress(numbers, "drawing photos"):
-        view = toy_camera(camera, np.radians(azimuth[i]), size)
+        view = toy_camera(camera_rng, np.radians(azimuth[i]), size)
         _, c2w, w, h = view
         to_sun = cv2.Rodrigues((0, 0, turn[i]))[0] @ SUN
         linear = render(view, parts, background, to_sun, weather[i])
-        cover = draw_people(people, w, h, share[i])
+        cover = draw_people(people_rng, w, h, share[i])
         linear = linear * (1 - cover[:, 3:]) + cover[:, :3]
         d = ray_directions(*view)
         t, _ = trace(c2w[None, :, 3], d, parts)
         views.append(view)
-        images.append(develop(taste, linear, exposure).reshape(h, w, 3))
+        images.append(develop(exposure_rng, linear, exposure).reshape(h, w, 3))
         depth.append(t)
         surface.append(c2w[:, 3] + t[:, None] * d)
         occluder.append(cover[:, 3] > 0)
-    points, tracks = toy_points(sfm, views, depth, surface, occluder)
+    points, tracks = toy_points(sfm_rng, views, depth, surface, occluder)
     K, c2w, _, _ = zip(*views)
     for i in numbers:
-        shake_camera(shake, K[i], c2w[i], pose_noise * (not is_test[i]))
+        add_pose_noise(pose_rng, K[i], c2w[i], pose_noise * (not is_test[i]))
         c2w[i][:, 3] = c2w[i][:, 3] * TOY_SCALE + TOY_ORIGIN
     signs = np.array(list(itertools.product((-1, 1), repeat=3)))
     corners = [part.centre + part.half * signs for part in toy_landmark(landmark)]
@@ -701,7 +703,7 @@ def make_toy(seed=0, size=96, photos=48, test=8, occluders=0.05, exposure=1.0,
 
 
 def toy_walls(scene, surface, background, landmark):
-    """The arrays of OPTIONAL about surfaces, from visible points (P,3) in the toy's units."""
+    """OPTIONAL arrays about surfaces, from visible points (P,3) in the toy's units."""
     def sdf(x):  # (P,3) -> (P,), scene units
         world = x * scene["scale"] + scene["center"]
         return toy_sdf(world, background, landmark) / scene["scale"]

@@ -484,7 +484,7 @@ def test_pose_noise_is_in_pixels_rms():
     for _ in range(500):
         c2w = np.eye(3, 4)
         c2w[2, 3] = -4  # looks at the landmark
-        data_prep.shake_camera(rng, K, c2w, 2.0)
+        data_prep.add_pose_noise(rng, K, c2w, 2.0)
         uv, _ = data_prep.project(K, c2w, np.zeros((1, 3)))
         shift.append(lengths(uv - 16))
     assert abs(np.mean(np.square(shift)) - 4) < .4
