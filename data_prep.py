@@ -510,8 +510,8 @@ def shade(o, d, parts, background, sun, weather):
         own = which[hit] == i
         normal[own] = gradient(lambda x: part_sdf(part, x), x[own], 1e-5)
         surface[own] = surface_colour(part, x[own])
-    in_sun = trace(x + 1e-4 * normal, sun[None], parts)[0] == np.inf
-    sunlight = np.maximum(normal @ sun, 0) * in_sun
+    obstacle, _ = trace(x + 1e-4 * normal, sun[None], parts)
+    sunlight = np.maximum(normal @ sun, 0) * (obstacle == np.inf)
     light = sunlight[:, None] * (1.15, 1.05, 0.88)
     light += (0.20 + 0.10 * normal[:, 2:]) * (0.8, 0.92, 1.15)
     clear = np.exp(-np.maximum(t - 5, 0) / 20)
@@ -1087,29 +1087,29 @@ def model_folders(folder):
 
 
 def find_model(folder, command):
-    """The model in the folder with most photos; tells what that leaves out."""
+    """The model in the folder with most photos; prints which photos and models it lacks.
+
+    command: how a model is made, for messages
+    """
     models = [open_model(folder, sparse) for sparse in model_folders(folder)]
     if not models and folder.name in ("images", "input"):
         parent = Path(os.path.abspath(folder)).parent
         check(not model_folders(parent),
               f"{folder} has no COLMAP model, the folder around it has: give {parent}")
     check(models,
-          f"{folder} has no binary COLMAP model: run python data_prep.py {command}, or for a "
-          "text model colmap model_converter --output_type BIN")
+          f"{folder} has no binary COLMAP model: run {command}, or for a text model "
+          "colmap model_converter --output_type BIN")
     best = max(models, key=lambda model: model.count)
     check(best.photos,
-          f"{best.sparse} is an empty model, no photo is posed: delete it and run "
-          f"python data_prep.py {command}")
+          f"{best.sparse} is an empty model, no photo is posed: delete it and run {command}")
     lost = sorted(best.photos.keys() - best.files)
     if lost:
         hint = name_hint(lost[0], best.on_disk)
         says = f"{len(lost)} photos of {best.sparse} are not on disk, such as {lost[0]!r}{hint}"
-        check(best.files,
-              f"{says}: put them into {folder / 'images'}, or run "
-              f"python data_prep.py {command}")
+        check(best.files, f"{says}: put them into {folder / 'images'}, or run {command}")
         warn(says)
-    print(f"{best.images}: {max(len(model.on_disk) for model in models)} photos on disk, "
-          f"{len(best.files)} posed by {best.sparse}")
+    on_disk = max(len(model.on_disk) for model in models)
+    print(f"{best.images}: {on_disk} photos on disk, {len(best.files)} posed by {best.sparse}")
     for model in models:
         if model.photos.keys() != best.photos.keys():
             print(f"left out is another model: {len(model.photos)} posed by {model.sparse}")
@@ -1369,10 +1369,10 @@ def read_usable(model, points, rows, held_out, downscale):
 def prepare(name, downscale=2, split=None):
     """Scene of one of SCENES, or of a folder with photos and a COLMAP model; see FORMAT."""
     folder = Path(name)
-    command = f"{name} --sfm"
+    command = f"python data_prep.py {name} --sfm"
     if name in SCENES:
         folder = DATA / name
-        command = f"{name} --download"
+        command = f"python data_prep.py {name} --download"
         if not folder.is_dir():
             folder = DATA / SCENES[name][0]
     model = find_model(folder, command)
