@@ -941,7 +941,8 @@ def read_photos(sparse):
         name = name.replace("\\", "/")  # of Windows
         (sightings,) = read("Q")
         ids = read(f"{3 * sightings}Q")[2::3]  # of u, v, point
-        check(name not in photos and not {"", ".."} & set(name.split("/")),
+        is_outside = any(step in ("", "..") for step in name.split("/"))
+        check(name not in photos and not is_outside,
               f"{sparse}: photo {name!r} occurs twice or lies outside the image folder: "
               "rename it")
         photos[name] = cameras.get(camera), np.array(pose), ids
