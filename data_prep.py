@@ -625,9 +625,9 @@ def toy_points(rng, views, depth, surface, occluder):
     is_wrong = rng.random((len(x), 1)) < 0.015
     x += is_wrong * rng.uniform(-1, 1, x.shape)
     x += rng.normal(0, 0.005, x.shape)
-    views = np.bincount(np.concatenate(tracks), minlength=len(x))
     error = np.zeros(len(x))
-    return np.column_stack([x * TOY_SCALE + TOY_ORIGIN, error, views]), tracks
+    sightings = np.bincount(np.concatenate(tracks), minlength=len(x))
+    return np.column_stack([x * TOY_SCALE + TOY_ORIGIN, error, sightings]), tracks
 
 
 def add_pose_noise(rng, K, c2w, pixels):
@@ -696,8 +696,7 @@ def make_toy(seed=0, size=96, photos=48, test=8, occluders=0.05, exposure=1.0,
     scene = build_scene(
         images, K, c2w, is_test, [f"toy_{i:03d}.png" for i in numbers], points, tracks,
         info, contain=np.array(corners) * TOY_SCALE + TOY_ORIGIN)
-    depth = np.concatenate(depth) * TOY_SCALE / scene["scale"]
-    scene["depth"] = depth.astype(np.float16)
+    scene["depth"] = np.float16(np.concatenate(depth) * TOY_SCALE / scene["scale"])
     scene["occluder"] = np.concatenate(occluder)
     return scene | toy_walls(scene, np.concatenate(surface)[::9], background, landmark)
 
