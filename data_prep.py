@@ -130,22 +130,22 @@ def progress(items, what):
 
 def atomic_write(path, write):
     """write(temporary path), then rename: `path` is the whole old file or the new one."""
-    part = path.with_name(f".{path.stem}.{os.getpid()}.{time.time_ns()}{path.suffix}")
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}.{time.time_ns()}{path.suffix}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        result = write(part)
+        result = write(temporary)
         check(result is not False, f"cannot encode {path}")  # so cv2.imwrite says no
-        part.replace(path)
+        temporary.replace(path)
     except OSError as e:
         says = f"cannot write {path} ({e.strerror or e}): free or choose a place"
         raise UserError(says) from e
     finally:
-        part.unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
 
 
 def write_scene(path, scene):
     """Not compressed: a third larger, but six times faster to write."""
-    atomic_write(path, lambda part: np.savez(part, **scene))
+    atomic_write(path, lambda temporary: np.savez(temporary, **scene))
 
 
 def refuse_bomb(path):
@@ -197,9 +197,37 @@ def read_scene(path):
     return scene
 
 
+# ---- pixels and rays -------------------------------------------------------------------
 def lengths(x):
-    """Of vectors (P,3) -> (P,)"""
+    """Lengths of vectors. (P,3) -> (P,)"""
     return np.linalg.norm(x, axis=1)
+
+
+def ray_directions(K, c2w, w, h, offset=(0.5, 0.5)):
+    """Unit vectors through each pixel's offset, in world axes, row by row. -> (h*w,3)"""
+    uv = np.indices((w, h)).T.reshape(-1, 2)
+    xy = (uv + offset - K[2:]) / K[:2]
+    d = np.column_stack([xy, np.ones(w * h)])
+    d /= lengths(d)[:, None]
+    return d @ c2w[:, :3].T
+
+
+def project(K, c2w, x):
+    """Pixels (P,2), -1e9 behind the camera, and distances (P,) of points x (P,3)."""
+    p = (x - c2w[:, 3]) @ c2w[:, :3]
+    z = p[:, 2:]
+    uv = p[:, :2] / np.maximum(z, 1 / FAR) * K[:2] + K[2:]
+    return np.where(z > 0, uv, -1e9), lengths(p)
+
+
+def is_in_photo(uv, wh):
+    """Which pixels uv (P,2) lie in a photo of width and height wh. -> (P,)"""
+    return ((uv >= 0) & (uv < wh)).all(1)
+
+
+def pixel_index(uv, wh):
+    """Row-by-row indices of pixels uv (P,2), moved inside a photo of size wh. -> (P,)"""
+    return np.clip(uv, 0, np.subtract(wh, 1)).astype(int) @ (1, wh[0])
 
 
 # ---- the toy: z up, front towards -y, in its own units ---------------------------------
@@ -230,7 +258,8 @@ MATERIALS = dict(
     paving=Material((0.48, 0.42, 0.34), (0.42, 0.42), 0.2),
     meadow=Material((0.17, 0.22, 0.08), (0.6, 0.6), 0.1),
 )
-ALIKE = [("stone", "pale"), ("sand", "brick"), ("tiles", "slate", "copper")]
+# Other landmarks may swap materials within a group.
+INTERCHANGEABLE = [("stone", "pale"), ("sand", "brick"), ("tiles", "slate", "copper")]
 
 
 class Part(NamedTuple):
@@ -251,11 +280,11 @@ PLINTH = [
     Part("box", centre=(-.01, -.03, .05), half=(.96, .53, .05), material="stone"),
     Part("box", centre=(-.05, 0, .15), half=(.85, .47, .05), material="stone"),
 ]
-HALL = [
+COLUMNS = [
     Part("column", centre=(x, -.34, .47), half=(.062, .062, .27), top=.05, material="pale")
     for x in np.linspace(-.54, .60, 6)
 ]
-HALL += [
+HALL = COLUMNS + [
     Part("box", centre=(.03, .2, .53), half=(.59, .26, .33), material="sand"),
     Part("box", centre=(.03, .03, .8), half=(.67, .46, .06), material="pale"),
     Part("box", centre=(.03, .03, .98), half=(.71, .48, .12), top=0, material="tiles"),
@@ -297,46 +326,39 @@ for x, y, wide, tall in HOUSES:
 
 
 def stretch(rng, parts):
-    """The parts, which stand on each other, in other proportions and moved a little."""
+    """Parts that stand on each other, in random proportions and moved a little."""
     size = rng.uniform(0.7, 1.2, 3)
     shift = np.append(rng.uniform(-0.06, 0.06, 2), 0)
-    centres = np.array([part.centre for part in parts])
-    foot = centres.mean(0)
-    foot[2] = centres[0, 2] - parts[0].half[2]
-    changed = []
-    for part, centre in zip(parts, centres):
+    foot = np.mean([part.centre for part in parts], axis=0)
+    foot[2] = parts[0].centre[2] - parts[0].half[2]
+    stretched = []
+    for part in parts:
         grow = size if part.shape == "box" else size[[2, 2, 2]]  # others stay round
-        changed.append(part._replace(
-            centre=foot + (centre - foot) * size + shift,
+        stretched.append(part._replace(
+            centre=foot + (part.centre - foot) * size + shift,
             half=part.half * grow,
             top=part.widths[1] * grow[0]))
-    return changed
+    return stretched
 
 
 def toy_landmark(number):
-    """The parts of the landmark; for other numbers than 0 it is another building."""
+    """The parts of a landmark; every number is another building."""
     if number == 0:
         return PLINTH + HALL + DOME + TOWER + ANNEX + STATUE
     rng = np.random.default_rng([number, 1])
     hall = stretch(rng, HALL + DOME)
-    hall[len(HALL):] = stretch(rng, hall[len(HALL):])
-    parts = PLINTH + hall
+    dome = stretch(rng, hall[len(HALL):])  # once more
+    parts = PLINTH + hall[:len(HALL)] + dome
     for group in (TOWER, ANNEX, STATUE):
         parts += stretch(rng, group)
-    side = rng.choice((-1, 1))
-    other = {"gold": "gold"}
-    for names in ALIKE:
-        other |= dict(zip(names, rng.permutation(names)))
+    mirror = np.array([rng.choice((-1, 1)), 1, 1])
+    material = {"gold": "gold"}
+    for names in INTERCHANGEABLE:
+        material |= dict(zip(names, rng.permutation(names)))
     return [
-        part._replace(centre=part.centre * np.array([side, 1, 1]),
-                      material=other[part.material])
+        part._replace(centre=part.centre * mirror, material=material[part.material])
         for part in parts
     ]
-
-
-def toy_parts(landmark, background):
-    """The landmark's parts, and the town's if there is a background."""
-    return toy_landmark(landmark) + TOWN * background
 
 
 def part_sdf(part, x):
@@ -346,7 +368,7 @@ def part_sdf(part, x):
         return z
     if part.shape == "ball":
         return np.hypot(np.hypot(x, y), z) - part.half[0]
-    # First in the plane of u, across, and z: the slanted side, then bottom and top.
+    # In the plane of u, outwards, and z: distance d to the slanted side, bottom and top.
     u = abs(x) if part.shape == "box" else np.hypot(x, y)
     bottom, top = part.widths
     _, depth, half = part.half
@@ -369,20 +391,21 @@ def part_sdf(part, x):
 
 
 def gradient(sdf, x, step):
-    """Of a distance function, by central differences at x (P,3). -> (P,3)"""
-    ends = [sdf(x + axis) - sdf(x - axis) for axis in step * np.eye(3)]
-    return np.stack(ends, 1) / (2 * step)
+    """Gradient of a distance function at x (P,3), by central differences. -> (P,3)"""
+    rise = [sdf(x + axis) - sdf(x - axis) for axis in step * np.eye(3)]
+    return np.stack(rise, axis=1) / (2 * step)
 
 
 def toy_sdf(x_world, background=True, landmark=0):
-    """Signed distance of the toy, + and exact outside, SfM units. (P,3) -> (P,)"""
+    """Signed distance to the toy, + and exact outside, SfM units. (P,3) -> (P,)"""
     x = (x_world - TOY_ORIGIN) / TOY_SCALE
-    distances = [part_sdf(part, x) for part in toy_parts(landmark, background)]
+    parts = toy_landmark(landmark) + TOWN * background
+    distances = [part_sdf(part, x) for part in parts]
     return np.min(distances, axis=0) * TOY_SCALE
 
 
-def enter_part(part, o, d):
-    """Where rays o, d (R,3) enter a part; inf for a miss. -> (R,)
+def intersect_part(part, o, d):
+    """Distances at which rays o, d (R,3) enter a part; inf for a miss. -> (R,)
 
     A part is where a quadric and up to two slabs overlap. The quadric is round in the
     first n coordinates, and its radius is linear in z: a roof has n = 1 and two slabs,
@@ -420,7 +443,7 @@ def trace(o, d, parts):
 
     -> distance (R,), inf is sky, and number of the part (R,)
     """
-    enter = np.stack([enter_part(part, o, d) for part in parts])
+    enter = np.stack([intersect_part(part, o, d) for part in parts])
     return enter.min(0), enter.argmin(0)
 
 
@@ -432,13 +455,13 @@ def sky_colour(d, weather):
     cloud = np.sin(5 * azimuth + 9 * wind) * np.sin(12 * up + 7 * wind)
     colour = (0.58, 0.68, 0.78) - np.clip(up * 1.5, 0, 1) * (0.52, 0.46, 0.26)
     colour = colour + 0.4 * np.array(tint) + 0.5 * abs(wind) * np.maximum(cloud, 0)
-    for slope, swing, waves, hill in [
+    for height, amplitude, waves, hill in [
         (0.11, 0.045, 5, (0.25, 0.33, 0.45)),
         (0.06, 0.03, 9, (0.11, 0.18, 0.16)),
     ]:
-        ridge = np.sin(waves * azimuth + slope * 40)
+        ridge = np.sin(waves * azimuth + height * 40)
         ridge = ridge + 0.6 * np.sin(2.3 * waves * azimuth)
-        colour = np.where(up < slope + swing * ridge, hill, colour)
+        colour = np.where(up < height + amplitude * ridge, hill, colour)
     return colour
 
 
@@ -458,17 +481,16 @@ def texture(name, across, up):
     return colour * brightness[:, None]
 
 
-def paint(part, x):
+def surface_colour(part, x):
     """Colours at points on a part's surface. (P,3) -> (P,3)"""
     x, y, z = x.T
     if part.shape == "ground":
-        is_paved = np.hypot(x, y) < 2.6
-        return np.where(
-            is_paved[:, None], texture("paving", x, y), texture("meadow", x, y))
-    if part.shape == "box":
-        return texture(part.material, x + y, z)
-    turn = np.arctan2(y - part.centre[1], x - part.centre[0])
-    return texture(part.material, turn, z)
+        is_paved = np.hypot(x, y)[:, None] < 2.6
+        return np.where(is_paved, texture("paving", x, y), texture("meadow", x, y))
+    across = x + y
+    if part.shape != "box":
+        across = np.arctan2(y - part.centre[1], x - part.centre[0])
+    return texture(part.material, across, z)
 
 
 def shade(o, d, parts, background, sun, weather):
@@ -487,9 +509,9 @@ def shade(o, d, parts, background, sun, weather):
         part = parts[i]
         own = which[hit] == i
         normal[own] = gradient(lambda x: part_sdf(part, x), x[own], 1e-5)
-        surface[own] = paint(part, x[own])
-    in_sun = trace(x + 1e-4 * normal, sun[None], parts)[0] == np.inf
-    sunlight = np.maximum(normal @ sun, 0) * in_sun
+        surface[own] = surface_colour(part, x[own])
+    obstacle, _ = trace(x + 1e-4 * normal, sun[None], parts)
+    sunlight = np.maximum(normal @ sun, 0) * (obstacle == np.inf)
     light = sunlight[:, None] * (1.15, 1.05, 0.88)
     light += (0.20 + 0.10 * normal[:, 2:]) * (0.8, 0.92, 1.15)
     clear = np.exp(-np.maximum(t - 5, 0) / 20)
@@ -497,21 +519,15 @@ def shade(o, d, parts, background, sun, weather):
     return colour
 
 
-def ray_directions(K, c2w, w, h, offset=(0.5, 0.5)):
-    """Unit vectors through each pixel's offset, in world axes, row by row. -> (h*w,3)"""
-    uv = np.indices((w, h)).T.reshape(-1, 2)
-    xy = (uv + offset - K[2:]) / K[:2]
-    d = np.column_stack([xy, np.ones(w * h)])
-    d /= lengths(d)[:, None]
-    return d @ c2w[:, :3].T
-
-
-def project(K, c2w, x):
-    """Pixels (P,2), -1e9 behind the camera, and distances (P,) of points x (P,3)."""
-    p = (x - c2w[:, 3]) @ c2w[:, :3]
-    z = p[:, 2:]
-    uv = p[:, :2] / np.maximum(z, 1 / FAR) * K[:2] + K[2:]
-    return np.where(z > 0, uv, -1e9), lengths(p)
+def render(view, parts, background, sun, weather):
+    """Linear colours of a photo, the mean of four rays a pixel. -> (h*w,3) in 0..1"""
+    _, c2w, _, _ = view
+    samples = []
+    for offset in itertools.product((0.25, 0.75), repeat=2):  # places in a pixel
+        d = ray_directions(*view, offset)
+        colour = shade(c2w[None, :, 3], d, parts, background, sun, weather)
+        samples.append(np.clip(colour, 0, 1))
+    return np.mean(samples, axis=0)
 
 
 def toy_camera(rng, azimuth, size):
@@ -537,7 +553,7 @@ def toy_camera(rng, azimuth, size):
     return (f, f, w / 2, h / 2), c2w, w, h
 
 
-# A passer-by's strokes: both ends x y and width, in heights above the feet; whose colour.
+# The strokes of a passer-by: from x y, to x y, width, in heights above the feet; colour.
 STROKES = [
     ((-0.06, 0.03), (-0.06, 0.45), 0.10, "legs"),
     ((0.06, 0.03), (0.06, 0.45), 0.10, "legs"),
@@ -555,61 +571,67 @@ def draw_people(rng, w, h, share):
     canvas = np.zeros((4 * h, 4 * w, 4), np.float32)  # drawn large, then averaged
     left = share
     while left > max(0.1 * share, 0.002):
-        tall = np.sqrt(left * w * h / 0.25) * rng.uniform(0.5, 1)
-        tall = 4 * np.clip(tall, 0.12 * h, 0.95 * h)
-        feet = rng.uniform((0, 3.2 * h), (4 * w, 4 * h + 0.2 * tall))
-        vivid = 0.02 + 0.83 * rng.beta(0.4, 0.4, (4, 3))  # or black, or white
-        coat, legs, thing, skin = vivid
+        height = np.sqrt(left * w * h / 0.25) * rng.uniform(0.5, 1)
+        height = 4 * np.clip(height, 0.12 * h, 0.95 * h)
+        feet = rng.uniform((0, 3.2 * h), (4 * w, 4 * h + 0.2 * height))
+        # Most colours are vivid, black or white.
+        coat, legs, thing, skin = 0.02 + 0.83 * rng.beta(0.4, 0.4, (4, 3))
         skin = (0.3 + skin[:1]) * (0.8, 0.6, 0.45)
         stripe = thing if rng.random() < 0.4 else coat
         colours = dict(coat=coat, legs=legs, thing=thing, skin=skin, stripe=stripe)
-        spot = rng.uniform((-0.25, 0.5), (0.25, 1.15))  # of a bag, balloon or hat
-        end = spot + rng.uniform(-0.15, 0.15, 2)
-        strokes = [*STROKES, (spot, end, rng.uniform(0.08, 0.25), "thing")]
-        for first, last, wide, whose in strokes:
-            ends = feet + np.array([first, last]) * (tall, -tall)
-            first, last = ends.astype(int).tolist()
-            colour = *colours[whose].tolist(), 1
-            cv2.line(canvas, first, last, colour, int(wide * tall) + 1)
+        begin = rng.uniform((-0.25, 0.5), (0.25, 1.15))  # of a bag, balloon or hat
+        end = begin + rng.uniform(-0.15, 0.15, 2)
+        strokes = [*STROKES, (begin, end, rng.uniform(0.08, 0.25), "thing")]
+        for begin, end, width, colour in strokes:
+            ends = feet + np.array([begin, end]) * (height, -height)
+            rgba = (*colours[colour].tolist(), 1)
+            cv2.line(canvas, *ends.astype(int), rgba, int(width * height) + 1)
         left = share - canvas[..., 3].mean()
     small = cv2.resize(canvas, (w, h), interpolation=cv2.INTER_AREA)
     return small.reshape(-1, 4).astype(float)
 
 
-def toy_points(rng, photos):
-    """Points as by SfM: noisy, 1.5 % of them wrong.
+def develop(rng, linear, exposure):
+    """With a random exposure, white balance and contrast. linear (P,3) -> uint8 (P,3)"""
+    brightness, red, blue, contrast = exposure * rng.uniform(-1, 1, 4)
+    gain = 2 ** (brightness / 2) * np.array([1 + 0.1 * red, 1, 1 + 0.1 * blue])
+    srgb = np.clip(linear * gain, 0, 1) ** (1.2 ** contrast / 2.2)
+    return (srgb * 255 + 0.5).astype(np.uint8)
 
-    photos: of each its view, surface (P,3), depth (P,) and people (P,)
-    -> points (K,5) as in build_scene, and the numbers of those that each photo sees
+
+def toy_points(rng, views, depth, surface, occluder):
+    """Points as by SfM, noisy and 1.5 % of them wrong, from lists with an item a photo.
+
+    views: K, c2w, width, height; depth (P,); surface (P,3); occluder (P,) bool
+    -> points (K,5) and tracks, as in build_scene
     """
-    places = []
-    count = 3000 // len(photos)
-    for _, surface, depth, people in photos:
-        ok = (depth < 30) & ~people
-        is_near = (abs(surface - (0, 0, 1.02)) < (1.3, 1.3, 1)).all(1)  # the landmark
+    samples = []
+    count = 3000 // len(views)
+    for x, t, people in zip(surface, depth, occluder):
+        ok = (t < 30) & ~people
+        is_near = (abs(x - (0, 0, 1.02)) < (1.3, 1.3, 1)).all(1)  # the landmark
         for some, n in [(ok & is_near, count), (ok & ~is_near, count // 5)]:
             if some.any():
-                places.append(surface[rng.choice(np.flatnonzero(some), n)])
-    x = np.concatenate(places)
+                samples.append(x[rng.choice(np.flatnonzero(some), n)])
+    x = np.concatenate(samples)
     tracks = []
-    for (K, c2w, w, h), _, depth, people in photos:
+    for (K, c2w, *wh), t, people in zip(views, depth, occluder):
         uv, distance = project(K, c2w, x)
-        pixel = np.clip(uv, 0, (w - 1, h - 1)).astype(int) @ (1, w)
-        is_inside = ((uv >= 0) & (uv < (w, h))).all(1)
-        is_visible = abs(depth[pixel] / distance - 1) < 0.02
-        is_visible &= is_inside & ~people[pixel]
+        pixel = pixel_index(uv, wh)
+        is_visible = abs(t[pixel] / distance - 1) < 0.02
+        is_visible &= is_in_photo(uv, wh) & ~people[pixel]
         is_found = rng.random(len(x)) < 0.6
         tracks.append(np.flatnonzero(is_visible & is_found))
     is_wrong = rng.random((len(x), 1)) < 0.015
     x += is_wrong * rng.uniform(-1, 1, x.shape)
     x += rng.normal(0, 0.005, x.shape)
-    views = np.bincount(np.concatenate(tracks), minlength=len(x))
     error = np.zeros(len(x))
-    return np.column_stack([x * TOY_SCALE + TOY_ORIGIN, error, views]), tracks
+    sightings = np.bincount(np.concatenate(tracks), minlength=len(x))
+    return np.column_stack([x * TOY_SCALE + TOY_ORIGIN, error, sightings]), tracks
 
 
-def shake_camera(rng, K, c2w, pixels):
-    """Moves c2w, in the toy's units, by noise of `pixels` rms at the landmark."""
+def add_pose_noise(rng, K, c2w, pixels):
+    """Turns and moves c2w, in the toy's units, by `pixels` rms at the landmark."""
     *turn, dx, dy = rng.normal(0, pixels / 2, 4) / K[0]  # [rad]: turned, and moved
     c2w[:, 3] += c2w[:, :2] @ (dx, dy) * np.linalg.norm(c2w[:, 3])
     c2w[:, :3] @= cv2.Rodrigues((*turn, 0))[0]
@@ -628,83 +650,75 @@ def make_toy(seed=0, size=96, photos=48, test=8, occluders=0.05, exposure=1.0,
     sun: its azimuth differs from photo to photo by up to so many degrees
     sky: how much its colour and clouds differ from photo to photo, 0 to 1
     """
-    info = dict(
-        locals(), scene="toy", kind="toy", downscale=1, folder=None, split=None)
-    is_sound = occluders <= 0.6 and exposure <= 2 and sun <= 180 and pose_noise < np.inf
-    is_sound &= min(seed, test, occluders, exposure, pose_noise, landmark, sun, sky) >= 0
-    check(is_sound and sky <= 1 and size >= 16 and photos >= 4,
+    info = dict(locals(), scene="toy", kind="toy", downscale=1, folder=None, split=None)
+    is_sound = (
+        seed >= 0 and size >= 16 and photos >= 4 and test >= 0 and landmark >= 0
+        and 0 <= occluders <= 0.6 and 0 <= exposure <= 2 and 0 <= pose_noise < np.inf
+        and 0 <= sun <= 180 and 0 <= sky <= 1)
+    check(is_sound,
           "occluders in 0..0.6, exposure 0..2, sun 0..180, sky 0..1, size >= 16, "
           "photos >= 4, others >= 0")
-    # No knob changes another's random numbers.
     generators = [np.random.default_rng([seed, k]) for k in range(7)]
-    camera, taste, people, sfm, shake, day, air = generators
+    # No knob changes another's random numbers.
+    camera_rng, exposure_rng, people_rng, sfm_rng, pose_rng, sun_rng, sky_rng = generators
     count = photos + test
     numbers = np.arange(count)
-    angles = 200 * (numbers + camera.uniform(0.1, 0.9, count)) / count - 100
-    views = [toy_camera(camera, angle, size) for angle in np.radians(angles)]
     is_test = np.isin(numbers, (np.arange(test) + 0.5) * count // test)
-    share = people.gamma(0.8 + 6 * occluders, size=count)  # some photos stay free
+    azimuth = 200 * (numbers + camera_rng.uniform(0.1, 0.9, count)) / count - 100
+    share = people_rng.gamma(0.8 + 6 * occluders, size=count)  # some photos stay free
     share = share * ~is_test
     share = np.minimum(share / share.sum() * photos * occluders, 0.85)
-    turns = np.radians(day.uniform(-sun, sun, count))
-    weather = air.uniform(-sky, sky, (count, 4))
-    parts = toy_parts(landmark, background)
-    depth, surface, images, occluder = [], [], [], []  # of each photo
+    turn = np.radians(sun_rng.uniform(-sun, sun, count))  # of the sun
+    weather = sky_rng.uniform(-sky, sky, (count, 4))
+    parts = toy_landmark(landmark) + TOWN * background
+    views, images, depth, surface, occluder = [], [], [], [], []  # of each photo
     for i in progress(numbers, "drawing photos"):
-        _, c2w, w, h = views[i]
-        o = c2w[None, :, 3]
-        to_sun = cv2.Rodrigues((0, 0, turns[i]))[0] @ SUN
-        linear = 0
-        for offset in itertools.product((0.25, 0.75), repeat=2):  # places in a pixel
-            d = ray_directions(*views[i], offset)
-            colour = shade(o, d, parts, background, to_sun, weather[i])
-            linear = linear + np.clip(colour, 0, 1) / 4
-        cover = draw_people(people, w, h, share[i])
-        linear = linear * (1 - cover[:, 3:]) + cover[:, :3]  # (h*w,3)
-        brightness, red, blue, contrast = exposure * taste.uniform(-1, 1, 4)
-        gain = 2 ** (brightness / 2) * np.array([1 + 0.1 * red, 1, 1 + 0.1 * blue])
-        srgb = np.clip(linear * gain, 0, 1) ** (1.2 ** contrast / 2.2)
-        images.append((srgb * 255 + 0.5).astype(np.uint8).reshape(h, w, 3))
-        d = ray_directions(*views[i])
-        t, _ = trace(o, d, parts)
+        view = toy_camera(camera_rng, np.radians(azimuth[i]), size)
+        _, c2w, w, h = view
+        to_sun = cv2.Rodrigues((0, 0, turn[i]))[0] @ SUN
+        linear = render(view, parts, background, to_sun, weather[i])
+        cover = draw_people(people_rng, w, h, share[i])
+        linear = linear * (1 - cover[:, 3:]) + cover[:, :3]
+        d = ray_directions(*view)
+        t, _ = trace(c2w[None, :, 3], d, parts)
+        views.append(view)
+        images.append(develop(exposure_rng, linear, exposure).reshape(h, w, 3))
         depth.append(t)
-        surface.append(o + t[:, None] * d)
+        surface.append(c2w[:, 3] + t[:, None] * d)
         occluder.append(cover[:, 3] > 0)
-    points, tracks = toy_points(sfm, list(zip(views, surface, depth, occluder)))
-    for (K, c2w, _, _), held_out in zip(views, is_test):
-        shake_camera(shake, K, c2w, pose_noise * (not held_out))
-        c2w[:, 3] = c2w[:, 3] * TOY_SCALE + TOY_ORIGIN
+    points, tracks = toy_points(sfm_rng, views, depth, surface, occluder)
+    K, c2w, _, _ = zip(*views)
+    for i in numbers:
+        add_pose_noise(pose_rng, K[i], c2w[i], pose_noise * (not is_test[i]))
+        c2w[i][:, 3] = c2w[i][:, 3] * TOY_SCALE + TOY_ORIGIN
     signs = np.array(list(itertools.product((-1, 1), repeat=3)))
     corners = [part.centre + part.half * signs for part in toy_landmark(landmark)]
-    K, c2w, _, _ = zip(*views)
     scene = build_scene(
         images, K, c2w, is_test, [f"toy_{i:03d}.png" for i in numbers], points, tracks,
         info, contain=np.array(corners) * TOY_SCALE + TOY_ORIGIN)
-    depth = np.concatenate(depth) * TOY_SCALE / scene["scale"]
-    scene["depth"] = depth.astype(np.float16)
+    scene["depth"] = np.float16(np.concatenate(depth) * TOY_SCALE / scene["scale"])
     scene["occluder"] = np.concatenate(occluder)
-    walls = np.concatenate(surface)[::9] * TOY_SCALE + TOY_ORIGIN
-    walls = (walls - scene["center"]) / scene["scale"]
-    walls = walls[lengths(walls) < 0.95]
-    return scene | toy_walls(scene, walls, background, landmark)
+    return scene | toy_walls(scene, np.concatenate(surface)[::9], background, landmark)
 
 
-def toy_walls(scene, wall, background, landmark):
-    """The arrays of TOY_FORMAT about surfaces, from visible points wall (P,3)."""
+def toy_walls(scene, surface, background, landmark):
+    """OPTIONAL arrays about surfaces, from visible points (P,3) in the toy's units."""
     def sdf(x):  # (P,3) -> (P,), scene units
         world = x * scene["scale"] + scene["center"]
         return toy_sdf(world, background, landmark) / scene["scale"]
 
+    wall = (surface * TOY_SCALE + TOY_ORIGIN - scene["center"]) / scene["scale"]
+    wall = wall[lengths(wall) < 0.95]
     normal = gradient(sdf, wall, 0.004)
     is_smooth = abs(lengths(normal) - 1) < 0.01
     near = wall + np.random.default_rng(0).normal(0, 0.02, wall.shape)
-    s = sdf(near)
-    is_near = abs(s) < 0.05
+    distance = sdf(near)
+    is_near = abs(distance) < 0.05
     return dict(
         wall=wall[is_smooth],
         wall_normal=normal[is_smooth],
         near_wall=near[is_near],
-        near_wall_sdf=s[is_near])
+        near_wall_sdf=distance[is_near])
 
 
 # ---- from photos, poses and points to a scene ------------------------------------------
@@ -784,6 +798,28 @@ def build_scene(
     return add_statistics(scene)
 
 
+def brightness_spread(points, brightness):
+    """Deviation of photos' brightness at equal points. Lists of (M,), an item a photo."""
+    all_points = np.concatenate(points)
+    mean = np.bincount(all_points, np.concatenate(brightness))
+    mean /= np.maximum(np.bincount(all_points), 1)  # (K,)
+    offsets = []
+    for own, b in zip(points, brightness):
+        if len(own):
+            offsets.append(np.median(b - mean[own]))
+    return np.std(offsets) if offsets else np.float64(0)
+
+
+def common_color(colors):
+    """Median of colours uint8 (P,3) in 0..1; NaN unless 60 % are like it. -> (3,)"""
+    if len(colors) > 100:  # fewer may all be people
+        median = np.median(colors, axis=0)
+        is_like = (abs(colors - median) < 5.1).all(1)
+        if is_like.mean() > 0.6:
+            return median / 255
+    return np.full(3, np.nan)
+
+
 def add_statistics(scene):
     """Adds the arrays of FORMAT that geonvs.py decides by.
 
@@ -795,19 +831,19 @@ def add_statistics(scene):
     rgb = scene["rgb"]
     masked = scene.get("masked", np.zeros(len(rgb), bool))
     step = max(1, len(rgb) // 500_000)
-    near, places = [], []  # of all photos
+    near, track_uv = [], []  # of all photos
     observed, sizes, brightness, background = [], [], [], []  # of the training photos
     photos = zip(scene["start"], scene["K"], scene["c2w"], scene["wh"])
     for i, (first, K, c2w, wh) in enumerate(photos):
         own = scene["track_point"][scene["track_photo"] == i]
         x = scene["points"][own]
         uv, distance = project(K, c2w, x)
-        places.append(np.clip(uv / wh, -1, 2))
+        track_uv.append(np.clip(uv / wh, -1, 2))
         near.append(max(0.8 * np.quantile(distance, 0.02), 0.02) if len(own) else 0.05)
         if scene["is_test"][i]:
             continue
         sizes.append(distance[lengths(x) < 1] / K[0])
-        pixel = first + np.clip(uv, 0, wh - 1).astype(int) @ (1, wh[0])
+        pixel = first + pixel_index(uv, wh)
         is_seen = ~masked[pixel]
         observed.append(own[is_seen])
         brightness.append(rgb[pixel[is_seen]].mean(1) / 255)
@@ -817,24 +853,12 @@ def add_statistics(scene):
         is_miss = lengths(closest) > 1
         is_miss &= ~masked[first:first + len(d)]
         background.append(rgb[first + np.flatnonzero(is_miss)[::step]])
-    points = np.concatenate(observed)
-    mean = np.bincount(points, np.concatenate(brightness))
-    mean /= np.maximum(np.bincount(points), 1)  # (K,)
-    offsets = [
-        np.median(b - mean[own]) for b, own in zip(brightness, observed) if len(own)]
-    background = np.concatenate(background)
-    color = np.full(3, np.nan)
-    if len(background) > 100:  # fewer may all be people
-        typical = np.median(background, 0)
-        agree = (abs(background - typical) < 5.1).all(1)
-        if agree.mean() > 0.6:
-            color = typical / 255
     return scene | dict(
         near=np.float32(near),
-        track_uv=np.concatenate(places, dtype=np.float32),
+        track_uv=np.concatenate(track_uv, dtype=np.float32),
         footprint=np.quantile(np.concatenate(sizes), 0.25),
-        exposure_spread=np.std(offsets) if offsets else np.float64(0),
-        bg_color=color)
+        exposure_spread=brightness_spread(observed, brightness),
+        bg_color=common_color(np.concatenate(background)))
 
 
 # ---- folders with photos, masks and COLMAP models --------------------------------------
@@ -892,10 +916,10 @@ def read_cameras(sparse):
         check(0 <= kind < len(CAMERA_MODELS),
               f"{sparse} has camera model {kind}, which is unknown: run "
               "colmap image_undistorter")
-        kind, names = list(CAMERA_MODELS.items())[kind]
+        model, names = list(CAMERA_MODELS.items())[kind]
         names = names.split()
         value = dict(zip(names, read(f"{len(names)}d")))
-        if kind in PERSPECTIVE:
+        if model in PERSPECTIVE:
             f = value.get("f")
             K = [value.get("fx", f), value.get("fy", f), value["cx"], value["cy"]]
             distortion = [value.get(name, 0.0) for name in OPENCV_DISTORTION]
@@ -916,7 +940,8 @@ def read_photos(sparse):
         name = name.replace("\\", "/")  # of Windows
         (sightings,) = read("Q")
         ids = read(f"{3 * sightings}Q")[2::3]  # of u, v, point
-        check(name not in photos and not {"", ".."} & set(name.split("/")),
+        is_outside = any(step in ("", "..") for step in name.split("/"))
+        check(name not in photos and not is_outside,
               f"{sparse}: photo {name!r} occurs twice or lies outside the image folder: "
               "rename it")
         photos[name] = cameras.get(camera), np.array(pose), ids
@@ -971,7 +996,10 @@ def files_below(folder, levels=7):
         for path in sorted(folder.iterdir()):
             if path.name.startswith((".", "@")):  # NAS boxes write @eaDir
                 continue
-            files += files_below(path, levels - 1) if path.is_dir() else [path]
+            if path.is_dir():
+                files += files_below(path, levels - 1)
+            else:
+                files.append(path)
     return files
 
 
@@ -1004,24 +1032,27 @@ def mask_files(images, names):
     return masks
 
 
-def match_names(wanted, there):
-    """{wanted name: its name there}: equal, or else equal but for case and Unicode form.
+def plain_name(name):
+    """The same for names that differ in case or Unicode form only."""
+    folded = unicodedata.normalize("NFC", name).casefold()
+    return unicodedata.normalize("NFC", folded)
 
-    The latter only if no second name is alike.
-    """
+
+def match_names(wanted, there):
+    """{wanted name: its name there}: equal, or of equal plain_name if only one has it."""
     found = {name: name for name in wanted if name in there}
-    alike = defaultdict(lambda: ([], []))
-    for side, names in enumerate([set(wanted) - found.keys(), set(there) - found.keys()]):
-        for name in names:
-            plain = unicodedata.normalize("NFC", name).casefold()
-            alike[unicodedata.normalize("NFC", plain)][side].append(name)
-    for ours, theirs in alike.values():
-        if len(ours) == len(theirs) == 1:
-            found[ours[0]] = theirs[0]
+    ours, theirs = defaultdict(list), defaultdict(list)  # plain name: names
+    for name in set(wanted) - found.keys():
+        ours[plain_name(name)].append(name)
+    for name in set(there) - found.keys():
+        theirs[plain_name(name)].append(name)
+    for plain in ours.keys() & theirs.keys():
+        if len(ours[plain]) == 1 and len(theirs[plain]) == 1:
+            found[ours[plain][0]] = theirs[plain][0]
     return found
 
 
-def nearest(name, names):
+def name_hint(name, names):
     """A hint at the name that may be meant, or nothing."""
     stem = PurePosixPath(name).stem
     close = [other for other in names if PurePosixPath(other).stem == stem]
@@ -1056,29 +1087,29 @@ def model_folders(folder):
 
 
 def find_model(folder, command):
-    """The model in the folder with most photos; tells what that leaves out."""
+    """The model in the folder with most photos; prints which photos and models it lacks.
+
+    command: how a model is made, for messages
+    """
     models = [open_model(folder, sparse) for sparse in model_folders(folder)]
     if not models and folder.name in ("images", "input"):
         parent = Path(os.path.abspath(folder)).parent
         check(not model_folders(parent),
               f"{folder} has no COLMAP model, the folder around it has: give {parent}")
     check(models,
-          f"{folder} has no binary COLMAP model: run python data_prep.py {command}, or for a "
-          "text model colmap model_converter --output_type BIN")
+          f"{folder} has no binary COLMAP model: run {command}, or for a text model "
+          "colmap model_converter --output_type BIN")
     best = max(models, key=lambda model: model.count)
     check(best.photos,
-          f"{best.sparse} is an empty model, no photo is posed: delete it and run "
-          f"python data_prep.py {command}")
+          f"{best.sparse} is an empty model, no photo is posed: delete it and run {command}")
     lost = sorted(best.photos.keys() - best.files)
     if lost:
-        hint = nearest(lost[0], best.on_disk)
+        hint = name_hint(lost[0], best.on_disk)
         says = f"{len(lost)} photos of {best.sparse} are not on disk, such as {lost[0]!r}{hint}"
-        check(best.files,
-              f"{says}: put them into {folder / 'images'}, or run "
-              f"python data_prep.py {command}")
+        check(best.files, f"{says}: put them into {folder / 'images'}, or run {command}")
         warn(says)
-    print(f"{best.images}: {max(len(model.on_disk) for model in models)} photos on disk, "
-          f"{len(best.files)} posed by {best.sparse}")
+    on_disk = max(len(model.on_disk) for model in models)
+    print(f"{best.images}: {on_disk} photos on disk, {len(best.files)} posed by {best.sparse}")
     for model in models:
         if model.photos.keys() != best.photos.keys():
             print(f"left out is another model: {len(model.photos)} posed by {model.sparse}")
@@ -1109,8 +1140,8 @@ def split_files(folder, split):
     if tables and tables[0].suffix == ".txt":
         name = tables[0].name
         tables = [
-            tables[0].with_name(re.sub("train|test", part, name))
-            for part in ("train", "test")
+            tables[0].with_name(re.sub("train|test", subset, name))
+            for subset in ("train", "test")
         ]
     return tables
 
@@ -1122,31 +1153,30 @@ def read_split(tables):
     """
     path = tables[0]
     if len(tables) == 2:
-        head = ["filename", "split"]
         rows = [
-            (name, part)
-            for part, path in zip(("train", "test"), tables)
-            for name, *_ in read_table(path)
+            dict(filename=words[0], split=subset)
+            for subset, names in zip(("train", "test"), tables)
+            for words in read_table(names)
         ]
     else:
-        head, *rows = read_table(path)
-    check({"filename", "split"} <= set(head),
-          f"{path} needs a header with filename and split")
+        head, *lines = read_table(path)
+        check("filename" in head and "split" in head,
+              f"{path} needs a header with filename and split")
+        rows = [dict(zip(head, words)) for words in lines]
     held_out = {}
-    for words in rows:
-        row = dict(zip(head, words))
+    for row in rows:
         if row.get("id") == "":
             continue
         name = row.get("filename")
-        part = row.get("split")
-        is_test = part == "test"
-        check(name and part in ("train", "test") and held_out.get(name, is_test) == is_test,
-              f"{path}: {name!r} is {part!r}; each is train or test, and not both")
+        subset = row.get("split")
+        is_test = subset == "test"
+        check(name and subset in ("train", "test") and held_out.get(name, is_test) == is_test,
+              f"{path}: {name!r} is {subset!r}; each is train or test, and not both")
         held_out[name] = is_test
     return held_out
 
 
-def choose_parts(folder, names, tables):
+def choose_held_out(folder, names, tables):
     """{name: whether it is held out} of the photos that are to be used; tells the rule."""
     if not tables:
         print(f"{folder} has no split file: every eighth photo is held out")
@@ -1154,7 +1184,7 @@ def choose_parts(folder, names, tables):
     print(f"split by {tables[0]}")
     held_out = read_split(tables)
     matches = match_names(held_out, names)
-    held_out = {matches.get(name, name): part for name, part in held_out.items()}
+    held_out = {matches.get(name, name): is_test for name, is_test in held_out.items()}
     rest = set(names) - held_out.keys()
     if rest:
         warn(f"{len(rest)} photos are not in {tables[0]}: {min(rest)} ...")
@@ -1204,6 +1234,15 @@ def is_heic(path):
     return head[4:8] == b"ftyp" and head[8:] in (b"heic", b"heix", b"mif1", b"msf1")
 
 
+def is_cut_off(data):
+    """Whether a JPEG or PNG file lacks its end. OpenCV does not tell."""
+    if data[1:4] == b"PNG":
+        return b"IEND" not in data
+    last_scan = data.rfind(b"\xff\xda")
+    end_mark = data.rfind(b"\xff\xd9")
+    return data[:2] == b"\xff\xd8" and end_mark < last_scan
+
+
 def decode(data, flags):
     """Image of OpenCV; None unless it is one."""
     try:
@@ -1231,11 +1270,7 @@ def read_photo(path, camera, downscale):
     check(path.is_file(), "is a broken link: copy the photo itself")
     check(not is_heic(path), "is HEIC, which cannot be read: convert it to JPEG")
     data = path.read_bytes()
-    # OpenCV is silent where a file is cut off. A JPEG has an end mark after its last scan.
-    is_cut_jpeg = (
-        data[:2] == b"\xff\xd8" and data.rfind(b"\xff\xd9") < data.rfind(b"\xff\xda"))
-    is_cut_png = data[1:4] == b"PNG" and b"IEND" not in data
-    check(not is_cut_jpeg and not is_cut_png, "is cut off: copy it again")
+    check(not is_cut_off(data), "is cut off: copy it again")
     image = decode(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     check(image is not None,
           "is empty, damaged, too large or no photo of a known type: replace it")
@@ -1300,8 +1335,8 @@ def read_usable(model, points, rows, held_out, downscale):
     misfits = {}  # photos that miss most of the points that they should see
     for name in progress(sorted(held_out), "preparing photos"):
         try:
-            check(name in model.photos, f"has no pose{nearest(name, model.files)}")
-            check(name in model.files, f"is not on disk{nearest(name, model.on_disk)}")
+            check(name in model.photos, f"has no pose{name_hint(name, model.files)}")
+            check(name in model.files, f"is not on disk{name_hint(name, model.on_disk)}")
             camera, pose, ids = model.photos[name]
             check_photo(camera, pose, held_out[name])
             image, K = read_photo(model.files[name], camera, downscale)
@@ -1311,7 +1346,7 @@ def read_usable(model, points, rows, held_out, downscale):
         c2w = camera_to_world(pose)
         own = np.array([rows[key] for key in ids if key in rows], int)
         uv, _ = project(K, c2w, points[own, :3])
-        is_inside = ((uv >= 0) & (uv < image.shape[1::-1])).all(1)
+        is_inside = is_in_photo(uv, image.shape[1::-1])
         if len(own) and is_inside.mean() < 0.5:
             misfits[name] = is_inside.mean()
         usable[name] = image, K, c2w, own
@@ -1334,10 +1369,10 @@ def read_usable(model, points, rows, held_out, downscale):
 def prepare(name, downscale=2, split=None):
     """Scene of one of SCENES, or of a folder with photos and a COLMAP model; see FORMAT."""
     folder = Path(name)
-    command = f"{name} --sfm"
+    command = f"python data_prep.py {name} --sfm"
     if name in SCENES:
         folder = DATA / name
-        command = f"{name} --download"
+        command = f"python data_prep.py {name} --download"
         if not folder.is_dir():
             folder = DATA / SCENES[name][0]
     model = find_model(folder, command)
@@ -1352,7 +1387,7 @@ def prepare(name, downscale=2, split=None):
         split=split)
     info["files"] = fingerprint(info)
     tables = split_files(folder, split)
-    held_out = choose_parts(folder, sorted(model.files), tables)
+    held_out = choose_held_out(folder, sorted(model.files), tables)
     points, rows = read_points(model.sparse)
     usable = read_usable(model, points, rows, held_out, downscale)
     masks = read_masks(model, usable)
@@ -1416,11 +1451,11 @@ def fetch(folder_url, path):
     if path.exists():
         return
     url = folder_url + path.name
-    part = path.with_name(path.name + ".part")
+    partial = path.with_name(path.name + ".part")
     try:
         path.parent.mkdir(exist_ok=True)
-        with open(part, "ab") as file:
-            have = max(file.tell() - 1, 0)  # the last byte again: also of a whole part
+        with open(partial, "ab") as file:
+            have = max(file.tell() - 1, 0)  # the last byte again: also of a whole file
             request = Request(url, headers={"Range": f"bytes={have}-"})
             with urlopen(request, timeout=60) as answer:
                 if answer.status != 206:
@@ -1430,10 +1465,10 @@ def fetch(folder_url, path):
                 for _ in progress(range(have, total, 1 << 20), f"MiB of {path.name}"):
                     have += file.write(answer.read(1 << 20))
         check(have == total, "it ended early")
-        part.replace(path)
+        partial.replace(path)
     except Exception as e:  # of the disk, the network or its protocol
         if getattr(e, "code", 0) == 416:  # longer than the file itself
-            part.unlink()
+            partial.unlink()
         says = f"the download of {url} broke ({e}); the same command continues it"
         raise UserError(says) from e
 
@@ -1451,19 +1486,19 @@ def unpack(archive, wanted, folder):
 def download(name):
     """Photos and reconstruction of one of SCENES, with its split file -> data/<name>/"""
     check(name in SCENES, f"--download knows {', '.join(SCENES)}, not {name}")
-    scene, table = SCENES[name]
-    home = DATA / name
-    table = DATA / table
-    archive = DATA / f"{scene}.tar.gz"
-    check(not home.exists(), f"{home} is there already: move it, or leave --download out")
-    fetch(SPLIT_URL, table)
+    inner, split = SCENES[name]
+    folder = DATA / name
+    split = DATA / split
+    archive = DATA / f"{inner}.tar.gz"
+    check(not folder.exists(), f"{folder} is there already: move it, or leave --download out")
+    fetch(SPLIT_URL, split)
     fetch(ARCHIVE_URL, archive)
     try:
         with tempfile.TemporaryDirectory(dir=DATA) as temporary:
-            unpack(archive, (f"{scene}/dense/images/", f"{scene}/dense/sparse/"), temporary)
-            place = Path(temporary) / scene
-            shutil.copy(table, place / table.name)
-            place.replace(home)
+            unpack(archive, (f"{inner}/dense/images/", f"{inner}/dense/sparse/"), temporary)
+            unpacked = Path(temporary) / inner
+            shutil.copy(split, unpacked / split.name)
+            unpacked.replace(folder)
     except Exception as e:  # a damaged archive can fail in any layer
         says = f"cannot unpack {archive} ({e}): free space, or delete it and retry"
         raise UserError(says) from e
@@ -1472,9 +1507,10 @@ def download(name):
 def sfm_photos(images):
     """{name: path} of raw photos, all of which pycolmap can read."""
     files = photo_files(images)
-    for name in [name for name, path in files.items() if not path.is_file()]:
-        warn(f"left out: {name} is a broken link")
-        del files[name]
+    for name, path in list(files.items()):
+        if not path.is_file():
+            warn(f"left out: {name} is a broken link")
+            del files[name]
     check(files, f"{images} has no photos: name the folder that holds them")
     heic = [name for name, path in files.items() if is_heic(path)]
     check(not heic,
@@ -1565,10 +1601,10 @@ def main(argv=None):
     add("--split", help="default: a .tsv, .csv or train_list.txt in it, or every 8th photo")
     knobs = inspect.signature(make_toy).parameters
     for key, knob in knobs.items():
-        how = {"type": type(knob.default)}
+        options = {"type": type(knob.default)}
         if isinstance(knob.default, bool):
-            how = {"action": argparse.BooleanOptionalAction}
-        add(f"--{key}", help=f"toy, default {knob.default}", **how)
+            options = {"action": argparse.BooleanOptionalAction}
+        add(f"--{key}", help=f"toy, default {knob.default}", **options)
     allow_any_character()
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C
     given = vars(parser.parse_args(argv))

@@ -405,7 +405,7 @@ def test_walls_agree_with_the_distance_function():
 
 
 def test_rays_end_on_the_part_they_hit():
-    parts = data_prep.toy_parts(0, True)
+    parts = data_prep.toy_landmark(0) + data_prep.TOWN
     o = np.array([[0, -4.0, 1]])
     d = np.random.default_rng(0).uniform(-1, 1, (999, 3))
     t, which = data_prep.trace(o, d, parts)
@@ -416,7 +416,7 @@ def test_rays_end_on_the_part_they_hit():
 
 
 def test_the_ground_behind_a_tower_is_darker():
-    parts = data_prep.toy_parts(0, True)
+    parts = data_prep.toy_landmark(0) + data_prep.TOWN
     o = np.array([[1.6, 1.1, 5], [.1, -.75, 5]])  # above the ground behind and before it
     d = np.array([[1e-6, 1e-6, -1]] * 2)
     behind, before = data_prep.shade(o, d, parts, True, data_prep.SUN, np.zeros(4)).mean(1)
@@ -484,7 +484,7 @@ def test_pose_noise_is_in_pixels_rms():
     for _ in range(500):
         c2w = np.eye(3, 4)
         c2w[2, 3] = -4  # looks at the landmark
-        data_prep.shake_camera(rng, K, c2w, 2.0)
+        data_prep.add_pose_noise(rng, K, c2w, 2.0)
         uv, _ = data_prep.project(K, c2w, np.zeros((1, 3)))
         shift.append(lengths(uv - 16))
     assert abs(np.mean(np.square(shift)) - 4) < .4
