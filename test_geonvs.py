@@ -3403,17 +3403,19 @@ def positional(x, octaves):
 
 class RadianceField(nn.Module):
     """NeRF's network: 8 layers with a skip to the fifth, density, then colour. W: width."""
-    def __init__(self, width, code_dim):
+    def __init__(self, width, code_dim, octaves):
         super().__init__()
-        self.first = layers(93, *[width] * 4)
-        self.second = layers(93 + width, *[width] * 4)
+        self.octaves = octaves  # of positions
+        inputs = 3 + 6 * octaves
+        self.first = layers(inputs, *[width] * 4)
+        self.second = layers(inputs + width, *[width] * 4)
         self.density = nn.Linear(width, 1)
         self.bottleneck = nn.Linear(width, width)
         self.color = geonvs.mlp(width + 27 + code_dim, width // 2, 3)
 
     def forward(self, x, d, code):
         """Density (R,S), colour (R,S,3), bottleneck (R,S,W) at x (R,S,3), d (R,3), code (R,A)."""
-        pe = positional(x, 15)  # (R,S,93)
+        pe = positional(x, self.octaves)  # (R,S,3+6 octaves)
         h = self.first(pe)  # (R,S,W)
         h = self.second(torch.cat([pe, h], 2))  # (R,S,W)
         sigma = F.softplus(self.density(h)).squeeze(2)  # (R,S)
@@ -3436,10 +3438,11 @@ class NeRFW(Rival):
     finer = 1  # samples in scoring over samples in training
 
     def make_parts(self, cfg, scene):
-        self.coarse = RadianceField(cfg.hidden, self.code_dim)
-        self.fine = RadianceField(cfg.hidden, self.code_dim)
+        octaves = int(1 + math.log2(math.pi / scene.raw["footprint"]))  # the last has two pixels
+        self.coarse = RadianceField(cfg.hidden, self.code_dim, octaves)
+        self.fine = RadianceField(cfg.hidden, self.code_dim, octaves)
         reach = torch.cdist(scene.c2w[:, :, 3], scene.points[::20])  # (I,K/20)
-        self.far = nn.Buffer(reach.quantile(0.999, dim=1))  # (I,)
+        self.far = nn.Buffer(reach.quantile(0.95, dim=1))  # (I,) the farthest points are wild
         self.make_heads(len(scene.wh), cfg.hidden // 2)
 
     def make_heads(self, photos, half):
@@ -3712,10 +3715,10 @@ def splat(center, cov, opacity, rgb, xy):
     return picture.flatten(0, 1)[which], trans[which]
 
 
-class Splats(Rival):
+class PlainSplats(Rival):
     """3D Gaussians (Kerbl et al. 2023) with appearance codes: a Gaussian has a feature, a small
     network makes its colour of that and a photo's code."""
-    name = "splats"
+    name = "plain splats"
     adam = dict(betas=(0.9, 0.999), eps=1e-15)
     batch = HaNeRF.batch
 
@@ -3763,12 +3766,12 @@ class Splats(Rival):
                     self.views[photo] = self.view(photo)
             mine = rays.img == photo  # (R,)
             xy = rays.uv[mine] * self.scene.wh[photo]  # px
-            rgb[mine] = self.draw(self.views[photo], code[mine][0], xy)
+            rgb[mine], _ = self.draw(self.views[photo], code[mine][0], xy)
         return dict(rgb=rgb, normal=torch.zeros_like(rgb), depth=torch.zeros_like(rgb[:, 0]))
 
     def view(self, photo):
         """Which Gaussians a photo sees, front first (N,); their centres (N,2) px and covariances
-        (N,2,2) px^2 in it."""
+        (N,2,2) px^2 in it; their distances (N,1) from the camera, without gradient."""
         K = self.scene.K[photo]
         c2w = self.scene.c2w[photo]
         turn = c2w[:, :3]
@@ -3781,31 +3784,69 @@ class Splats(Rival):
         order = order[is_seen[order]]
         axes = turn.T @ rotation(self.turn[order])
         axes = axes * self.log_size[order, None].exp()
-        center, cov = project(x[order], axes, K)
-        return order, center, cov
+        x = x[order]
+        center, cov = project(x, axes, K)
+        return order, center, cov, x.detach().norm(dim=1, keepdim=True)
 
     def draw(self, view, code, xy):
-        """Colours (R,3) of pixels xy (R,2) of a view under a code (A,)."""
-        order, center, cov = view
+        """Colours (R,3) of pixels xy (R,2) of a view under a code (A,), and mean distance (R,1) of
+        what is seen."""
+        order, center, cov, distance = view
         feature = torch.cat([self.feature[order], self.feature[-1:]])  # (N+1,F)
         codes = code.expand(len(feature), -1)
         rgb = self.paint(torch.cat([feature, codes], 1))
         rgb = (feature[:, :3] + rgb).sigmoid()
         opacity = self.opacity[order].sigmoid()
-        picture, trans = splat(center, cov, opacity, rgb[:-1], xy)
-        return picture + trans[:, None] * rgb[-1]
+        columns = torch.cat([rgb[:-1], distance], 1)  # (N,4)
+        picture, trans = splat(center, cov, opacity, columns, xy)
+        rgb = picture[:, :3] + trans[:, None] * rgb[-1]
+        seen = (1 - trans[:, None]).clamp_min(1e-3)
+        return rgb, (picture[:, 3:] / seen).detach()
 
     def losses(self, rays, photos, done, gen):
-        """Mean absolute error of rays of one photo."""
+        """Mean absolute error of rays of one photo, weighted by what the mask leaves."""
         self.views.clear()
         photo = photos.item()
         xy = rays.uv * self.scene.wh[photo]  # px
         code = self.appearance.weight[photo]
-        rgb = self.draw(self.view(photo), code, xy)
-        error = rgb - rays.rgb
-        loss = error.abs().mean()
-        mse = error.detach().square().mean()
-        return loss, dict(rgb=loss, mse=mse), {}
+        rgb, distance = self.draw(self.view(photo), code, xy)
+        residual = (rgb - rays.rgb).abs()
+        mask, reg = self.transients(rays, photos, done, residual.detach().amax(1), distance)
+        loss = ((1 - mask) * residual.mean(1)).mean()
+        mse = residual.detach().square().mean()
+        return loss + reg, dict(rgb=loss, reg=reg, mse=mse), {}
+
+    def transients(self, rays, photos, done, error, distance):
+        """Mask (R,) and its loss: none here."""
+        return torch.zeros_like(error), error.new_zeros(())
+
+
+class Splats(PlainSplats):
+    """Splats with this project's transient mask, as splats in the wild have one."""
+    name = "splats"
+
+    def make_parts(self, cfg, scene):
+        super().make_parts(cfg, scene)
+        self.cfg.mask = "on"
+        self.mask = geonvs.TransientMask(scene)
+
+    def groups(self):
+        mask = dict(params=list(self.mask.parameters()), base_lr=self.cfg.lr_mask, **self.adam)
+        return [*super().groups(), mask]
+
+    def transients(self, rays, photos, done, error, distance):
+        """As in GeoNVS.losses, without GPL, by the threshold at the mean place that is seen."""
+        logit = geonvs.sample_logits(self.mask.logits(photos), rays.uv)  # (R,)
+        if done >= geonvs.MASK_TRAINING:
+            logit = logit.detach()
+        place = geonvs.contract(rays.at(distance)[:, 0])  # (R,3)
+        excess = error * ~rays.is_static - self.mask.threshold(place)
+        cell = geonvs.place_cell(place)
+        every = torch.ones_like(excess, dtype=torch.bool)
+        geonvs.update_running_quantiles(
+            self.mask.place_error, geonvs.PLACE_QUANTILE, cell, error, every)
+        mask = geonvs.reject_outliers(logit.sigmoid().detach(), excess > 0, done)
+        return mask, geonvs.mask_loss(logit, excess)
 
 
 # ---- What rows replace: the paper's or a plainer form of a piece ---------------------------------
@@ -3856,7 +3897,7 @@ def even_samples(edges, weight, u):
 
 class NoThreshold(geonvs.TransientMask):
     """Any error counts."""
-    def threshold(self, place, margin):
+    def threshold(self, place):
         return torch.zeros_like(place[:, 0])
 
 
@@ -3883,6 +3924,8 @@ class NoNormal(geonvs.GeoNVS):
 
 class Density(NoNormal):
     """An octree NeRF-W: the field is a density exp(-10 s) instead of a distance."""
+    name = "density"
+
     def alpha(self, sdf, t, max_zeta=math.inf):
         mean = (sdf[:, :-1] + sdf[:, 1:]) / 2  # (R,S)
         sigma = torch.exp(-10 * mean.clamp(-2, 2))
@@ -3913,6 +3956,7 @@ class Row(NamedTuple):
     seeds: int = 99  # at most
 
 
+NO_GEOMETRY = dict(lam_eik=0.0, lam_curv=0.0, lam_sfm=0.0, lam_gpl=0.0)
 PAPER_MASK = dict(
     TransientMask=NoThreshold,
     mask_loss=paper_mask_loss,
@@ -3932,7 +3976,7 @@ PIECES = {
             neus_alpha=paper_alpha,
             edge_indicator=paper_phi,
             lipschitz_loss=paper_lipschitz_loss)),
-    "density": Row(dict(lam_eik=0.0, lam_curv=0.0, lam_sfm=0.0, lam_gpl=0.0), kind=Density),
+    "density": Row(NO_GEOMETRY, kind=Density),
     "no mask": Row(dict(mask="off")),
     "no threshold by place": Row(replaced=dict(PLACE_FACTOR=0.0)),
     "outliers kept": Row(replaced=dict(reject_outliers=keep_outliers)),
@@ -3961,17 +4005,25 @@ STRESS = {  # knobs of the toy, the row of PIECES that is made for them, seeds
     "wrong poses": (dict(photos=24, pose_noise=3.0), "no curvature", 3),
     "other building": (dict(photos=24, landmark=3), "no curvature", 1)}
 WIDE = dict(rays=1024, samples=64, hidden=256, lr_net=5e-4)
-PUBLISHED = {
-    geonvs.GeoNVS: {},
-    NeRFW: WIDE | dict(photos=1024),
-    HaNeRF: WIDE | dict(photos=1),
-    Splats: SPLATS}
-SMALL = {  # what serves the toy best
-    geonvs.GeoNVS: dict(rays=384, hidden=32, lr_net=1e-2, lr_grid=3e-2),
-    NeRFW: dict(rays=256, photos=256, samples=24, hidden=64, lr_net=5e-3),
-    HaNeRF: dict(rays=256, photos=1, samples=16, hidden=64, lr_net=4e-3),
-    Splats: SPLATS}
-RIVALS = [NeRFW, HaNeRF, Splats]
+LEAN = dict(rays=384, hidden=32, lr_net=1e-2, lr_grid=3e-2)
+SMALL = {  # methods of chart and stress, in sizes that serve the toy best in a minute
+    "geonvsw": Row(LEAN),
+    "geonvsw, defaults": Row(),
+    "density": Row(LEAN | NO_GEOMETRY, kind=Density),
+    "splats": Row(SPLATS, kind=Splats),
+    "splats, no mask": Row(SPLATS, kind=PlainSplats),
+    "nerfw": Row(
+        dict(rays=256, photos=256, samples=24, hidden=64, lr_net=5e-3),
+        kind=NeRFW),
+    "hanerf": Row(
+        dict(rays=256, photos=1, samples=16, hidden=64, lr_net=4e-3),
+        kind=HaNeRF)}
+PUBLISHED = SMALL | {
+    "geonvsw": Row(),
+    "density": Row(NO_GEOMETRY, kind=Density),
+    "nerfw": Row(WIDE | dict(photos=1024), kind=NeRFW),
+    "hanerf": Row(WIDE | dict(photos=1), kind=HaNeRF)}
+IN_STRESS = ("density", "splats", "nerfw", "hanerf")
 COSTS = {"train_seconds": "training, s", "energy_wh": "energy, Wh"}
 FIGURES = (
     "psnr", "psnr_floor", "ssim", "sdf_error", "normal_error", "mask_iou", "mask_static",
@@ -3979,34 +4031,30 @@ FIGURES = (
     "rays_per_second", "model_bytes", "parameters")
 
 
-def chart_rows(given, sizes):
-    """Every method with shares of the budget; ours also with less, to see when it passes what the
-    others end with."""
+def chart_rows(given, methods):
+    """Every method with a quarter of the budget, the budget, and four times as much."""
     unit = "steps" if "steps" in given else "minutes"
     whole = given.get(unit, 1.0)
     rows = {}
-    for kind, settings in sizes.items():
-        shares = (1 / 4, 1 / 2, 1, 2)
-        if kind is geonvs.GeoNVS:
-            shares = (1 / 16, 1 / 8) + shares
-        for share in shares:
+    for title, row in methods.items():
+        for share in (1 / 4, 1, 4):
             budget = max(1, int(share * whole)) if unit == "steps" else share * whole
-            rows[f"{kind.name} x{share:g}"] = Row(settings | {unit: budget}, kind=kind)
+            rows[f"{title} x{share:g}"] = row._replace(settings=row.settings | {unit: budget})
     return rows
 
 
-def stress_rows(given, sizes):
+def stress_rows(given, methods):
     """In every cell: the method, without the piece that is made for the cell, and its rivals."""
     budget = {} if {"steps", "minutes"} & set(given) else dict(minutes=1.5)
     rows = {}
     for cell, (toy, piece, seeds) in STRESS.items():
-        for how in ("full", piece):
-            row = PIECES[how]
-            settings = sizes[geonvs.GeoNVS] | budget | row.settings
-            rows[f"{cell}: {how}"] = row._replace(settings=settings, toy=toy, seeds=seeds)
-        for kind in RIVALS:
-            settings = sizes[kind] | budget
-            rows[f"{cell}: {kind.name}"] = Row(settings, kind=kind, toy=toy, seeds=seeds)
+        own = methods["geonvsw"].settings
+        here = {how: PIECES[how]._replace(settings=own | PIECES[how].settings)
+                for how in ("full", piece)}
+        here |= {title: methods[title] for title in IN_STRESS}
+        for title, row in here.items():
+            settings = budget | row.settings
+            rows[f"{cell}: {title}"] = row._replace(settings=settings, toy=toy, seeds=seeds)
     return rows
 
 
@@ -4088,17 +4136,14 @@ def time_to(lines, level, unit):
 
 
 def add_times(table):
-    """Adds to a chart's lines at what cost their method reaches each rival's best, and this over
-    what the rival took."""
-    for rival in RIVALS:
-        own = [line for line in table if method_of(line) == rival.name and line["psnr"]]
-        best = max(own, key=lambda line: line["psnr"], default=None)
+    """Adds to a chart's lines at what cost their method reaches the best of each method."""
+    methods = dict.fromkeys(map(method_of, table))
+    curves = {method: [line for line in table if method_of(line) == method] for method in methods}
+    for method, curve in curves.items():
+        best = max((line["psnr"] for line in curve if line["psnr"]), default=math.inf)
         for line in table:
-            mine = [other for other in table if method_of(other) == method_of(line)]
             for unit in COSTS:
-                hit = time_to(mine, best["psnr"], unit) if best else None
-                line[f"{unit}_to_{rival.name}"] = hit
-                line[f"{unit}_ratio_{rival.name}"] = hit / best[unit] if hit else None
+                line[f"{unit}_to_{method}"] = time_to(curves[method_of(line)], best, unit)
 
 
 def write_table(path, table):
@@ -4139,7 +4184,7 @@ def draw_bars(table, is_stress):
     rows = [line for line in table if line["psnr"]]
     if not is_stress:
         rows.sort(key=lambda line: line["psnr"])
-    colours = dict(full="C0", nerfw="C1", hanerf="C2", splats="C3")
+    colours = dict(full="C0", nerfw="C1", hanerf="C2", splats="C3", density="C4")
     figure = figures.Figure(figsize=(7.5, 1 + 0.25 * len(rows)), layout="constrained")
     axis = figure.subplots()
     base = "the baseline" if is_stress else "the first row"
@@ -4166,15 +4211,15 @@ def experiment(argv):
     given = vars(parser.parse_args(argv))
     name = given.pop("experiment")
     seeds = given.pop("seeds")
-    sizes = PUBLISHED if given.pop("published") else SMALL
+    methods = PUBLISHED if given.pop("published") else SMALL
     data_prep.check(seeds > 0, "--seeds: use a number from 1")
     is_plain = not (given.pop("resume") or given.pop("render"))
     data_prep.check(is_plain, "an experiment goes on by itself: no --resume, no --render")
     rows = dict(
-        chart=chart_rows(given, sizes),
+        chart=chart_rows(given, methods),
         pieces=PIECES,
         grid=GRID,
-        stress=stress_rows(given, sizes))[name]
+        stress=stress_rows(given, methods))[name]
     source = geonvs.make_config(given).source
     where = Path("runs", f"{name}-{data_prep.scene_path(source).stem}")
     table = []
@@ -4200,16 +4245,15 @@ def experiment(argv):
 # ---- Tests of Part II ----------------------------------------------------------------------------
 
 FEW = dict(rays=64, photos=4, samples=4, bg_samples=6, hidden=16)
-RIVAL = dict(
-    nerfw=FEW | dict(photos=64),
-    hanerf=FEW | dict(rays=256, photos=1),
-    splats=FEW | dict(rays=256, photos=1))
-KINDS = {kind.name: kind for kind in RIVALS}
+RIVALS = {  # tiny, of each method that is none of ours
+    title: row._replace(settings=FEW | dict(rays=256, photos=min(64, row.settings["photos"])))
+    for title, row in SMALL.items() if issubclass(row.kind, Rival)}
 
 
 def rival(scene, name):
     torch.manual_seed(0)
-    return KINDS[name](geonvs.Config(**RIVAL[name]), scene)
+    row = RIVALS[name]
+    return row.kind(geonvs.Config(**row.settings), scene)
 
 
 def close_to(a, b, atol=1e-4):
@@ -4218,13 +4262,13 @@ def close_to(a, b, atol=1e-4):
 
 # ---- Rivals
 
-@pytest.mark.parametrize("name", KINDS)
+@pytest.mark.parametrize("name", RIVALS)
 def test_losses_of_rivals_are_finite_and_reach_every_parameter(scene, name):
     model = rival(scene, name)
     gen = generator()
     for step in range(2):  # the second knows another photo's code
         rays, photos = model.batch(256, gen)
-        loss, terms, _ = model.losses(rays, photos, step, gen)
+        loss, terms, _ = model.losses(rays, photos, step / 2, gen)
         model.zero_grad()
         loss.backward()
     assert all(value.isfinite().all() for value in terms.values())
@@ -4332,8 +4376,8 @@ def quick_rows(monkeypatch, tmp_path):
     raw = toy()
     monkeypatch.setattr(data_prep, "open_scene", lambda *_: raw)
     monkeypatch.setattr(data_prep, "make_toy", lambda **knobs: raw)
-    sizes = {kind: RIVAL[name] for name, kind in KINDS.items()} | {geonvs.GeoNVS: FEW}
-    monkeypatch.setitem(globals(), "SMALL", sizes)
+    few = {title: row._replace(settings=row.settings | FEW) for title, row in SMALL.items()}
+    monkeypatch.setitem(globals(), "SMALL", few | RIVALS)
     monkeypatch.setitem(globals(), "STRESS", {"crowd": STRESS["crowd"]})
     return [f"--{key}={value}" for key, value in FEW.items()]
 
@@ -4361,7 +4405,7 @@ def test_what_a_row_replaces_is_there_and_changes_the_run(quick_rows, title):
         assert getattr(geonvs, name) is not value  # only during the run
 
 
-@pytest.mark.parametrize("name, rows", dict(chart=18, pieces=2, grid=2, stress=5).items())
+@pytest.mark.parametrize("name, rows", dict(chart=21, pieces=2, grid=2, stress=6).items())
 def test_an_experiment_writes_table_and_figure_and_reads_rows_again(
         quick_rows, name, rows, monkeypatch):
     monkeypatch.setitem(globals(), "PIECES", {k: PIECES[k] for k in ("full", "no mask")})
