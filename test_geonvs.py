@@ -3353,7 +3353,8 @@ def test_each_setting_is_used_and_is_a_flag_with_its_meaning_and_default():
 
 # ==== Part II: the rivals, and the experiments by name ============================================
 #     python test_geonvs.py chart    speed against accuracy: Geo-NVS-w and its rivals by budget
-#     python test_geonvs.py pieces   ablation; the equations as in the paper; density for SDF
+#     python test_geonvs.py paper    the paper's equations as printed; mask and GPL; density for SDF
+#     python test_geonvs.py pieces   ablation
 #     python test_geonvs.py grid     the octree against a uniform grid
 #     python test_geonvs.py stress   where methods fail: cells of the toy with knobs turned together
 # Flags of geonvs.py apply (--data, --downscale, --minutes, --steps ...) unless a row sets them, and
@@ -3961,7 +3962,7 @@ PAPER_MASK = dict(
     TransientMask=NoThreshold,
     mask_loss=paper_mask_loss,
     reject_outliers=keep_outliers)
-PIECES = {
+PAPER = {  # its equations as printed; the mask, GPL and the SDF
     "full": Row(),
     "GPL off": Row(dict(lam_gpl=0.0)),
     "GPL flat Phi": Row(replaced=dict(edge_indicator=flat_phi)),
@@ -3979,7 +3980,9 @@ PIECES = {
     "density": Row(NO_GEOMETRY, kind=Density),
     "no mask": Row(dict(mask="off")),
     "no threshold by place": Row(replaced=dict(PLACE_FACTOR=0.0)),
-    "outliers kept": Row(replaced=dict(reject_outliers=keep_outliers)),
+    "outliers kept": Row(replaced=dict(reject_outliers=keep_outliers))}
+PIECES = {
+    "full": Row(),
     "no SfM term": Row(dict(lam_sfm=0.0)),
     "no eikonal": Row(dict(lam_eik=0.0)),
     "no curvature": Row(dict(lam_curv=0.0)),
@@ -3993,7 +3996,7 @@ PIECES = {
 GRID = {
     "octree": Row(),
     "uniform grid": Row(replaced=dict(seed_octree=dense_octree, cells_to_split=no_cells))}
-STRESS = {  # knobs of the toy, the row of PIECES that is made for them, seeds
+STRESS = {  # knobs of the toy, the row of PAPER or PIECES that is made for them, seeds
     "easy": (dict(photos=48, occluders=0.04, exposure=0.5), "no mask", 1),
     "middle": (dict(photos=32, occluders=0.15, exposure=1.0, pose_noise=0.5), "GPL off", 1),
     "hard": (dict(photos=24, occluders=0.25, exposure=2.0, pose_noise=1.0), "no SfM term", 3),
@@ -4049,8 +4052,10 @@ def stress_rows(given, methods):
     rows = {}
     for cell, (toy, piece, seeds) in STRESS.items():
         own = methods["geonvsw"].settings
-        here = {how: PIECES[how]._replace(settings=own | PIECES[how].settings)
-                for how in ("full", piece)}
+        here = {}
+        for how in ("full", piece):
+            row = (PAPER | PIECES)[how]
+            here[how] = row._replace(settings=own | row.settings)
         here |= {title: methods[title] for title in IN_STRESS}
         for title, row in here.items():
             settings = budget | row.settings
@@ -4205,7 +4210,7 @@ def experiment(argv):
     has_matplotlib = importlib.util.find_spec("matplotlib")
     data_prep.check(has_matplotlib, "charts need matplotlib: pip install matplotlib")
     parser = geonvs.make_parser()
-    parser.add_argument("experiment", choices=("chart", "pieces", "grid", "stress"))
+    parser.add_argument("experiment", choices=("chart", "paper", "pieces", "grid", "stress"))
     parser.add_argument("--seeds", type=int, default=3, help="seeds of every row [3]")
     parser.add_argument("--published", action="store_true", help="rivals at published size")
     given = vars(parser.parse_args(argv))
@@ -4217,6 +4222,7 @@ def experiment(argv):
     data_prep.check(is_plain, "an experiment goes on by itself: no --resume, no --render")
     rows = dict(
         chart=chart_rows(given, methods),
+        paper=PAPER,
         pieces=PIECES,
         grid=GRID,
         stress=stress_rows(given, methods))[name]
@@ -4384,7 +4390,7 @@ def quick_rows(monkeypatch, tmp_path):
 
 REPLACING = {
     title: row
-    for title, row in (PIECES | GRID).items()
+    for title, row in (PAPER | PIECES | GRID).items()
     if row.replaced or row.kind is not geonvs.GeoNVS}
 REPLACING["no threshold by place"] = Row(replaced=dict(PLACE_FACTOR=1e9))  # seen in ten steps
 
@@ -4405,10 +4411,11 @@ def test_what_a_row_replaces_is_there_and_changes_the_run(quick_rows, title):
         assert getattr(geonvs, name) is not value  # only during the run
 
 
-@pytest.mark.parametrize("name, rows", dict(chart=21, pieces=2, grid=2, stress=6).items())
+@pytest.mark.parametrize("name, rows", dict(chart=21, paper=2, pieces=2, grid=2, stress=6).items())
 def test_an_experiment_writes_table_and_figure_and_reads_rows_again(
         quick_rows, name, rows, monkeypatch):
-    monkeypatch.setitem(globals(), "PIECES", {k: PIECES[k] for k in ("full", "no mask")})
+    monkeypatch.setitem(globals(), "PAPER", {k: PAPER[k] for k in ("full", "no mask")})
+    monkeypatch.setitem(globals(), "PIECES", {k: PIECES[k] for k in ("full", "no normal")})
     argv = [name, "--steps=4", "--seeds=1", *quick_rows]
     experiment(argv)
     table = Path(f"{name}.csv").read_text()
