@@ -469,21 +469,24 @@ def sphere(xyz, views=20, tracks=None, is_test=(False, False, False), error=0, c
         images, K, c2w, is_test, ["a"] * 3, points, tracks, {}, contain, masks)
 
 
-@pytest.mark.parametrize("size, place", [(1, 0), (3, 5)])
-def test_the_sphere_holds_a_ball_of_points(size, place):
-    scene = sphere(size * ball(2000) + place)
-    assert lengths(scene["center"] - place) < .05 * size
-    assert abs(scene["scale"] / size - 1.08) < .03
-    assert_close(world(scene, scene["c2w"][:, :, 3]), 0)
-
-
-@pytest.mark.parametrize("count, distance", [(120, 10), (200, 30), (600, 20), (20, 1e6)])
-def test_a_skyline_does_not_blow_it_up(count, distance):
+def with_skyline(count, distance):
     x = ball(count)
-    far = distance * x / lengths(x)[:, None]
-    scene = sphere(np.concatenate([ball(2000), far]))
-    assert abs(scene["scale"] - 1.08) < .1
-    assert lengths(scene["center"]) < .2
+    return np.concatenate([ball(2000), distance * x / lengths(x)[:, None]])
+
+
+@cases(
+    "xyz, scale, tolerance, place",
+    ball=(ball(2000), 1.08, .03, 0),
+    larger_ball=(3 * ball(2000) + 5, 3.24, .09, 5),
+    near_skyline=(with_skyline(120, 10), 1.08, .1, 0),
+    skyline=(with_skyline(200, 30), 1.08, .1, 0),
+    long_skyline=(with_skyline(600, 20), 1.08, .1, 0),
+    distant_skyline=(with_skyline(20, 1e6), 1.08, .1, 0))
+def test_the_sphere_holds_the_landmark(xyz, scale, tolerance, place):
+    scene = sphere(xyz)
+    assert abs(scene["scale"] - scale) < tolerance
+    assert lengths(scene["center"] - place) < 1.6 * tolerance
+    assert_close(world(scene, scene["c2w"][:, :, 3]), 0)
 
 
 @cases(
@@ -1327,23 +1330,11 @@ def test_misspelt_commands_exit_with_2(model, command):
     assert_error("error: ", command)
 
 
-def interrupt(**knobs):
-    raise KeyboardInterrupt
-
-
-def terminate(**knobs):
-    os.kill(os.getpid(), signal.SIGTERM)
-
-
-def fill_up(**knobs):
-    raise OSError(28, "No space left")
-
-
 @cases(
     "happens, says",
-    ctrl_c=(interrupt, "stopped"),
-    sigterm=(terminate, "stopped"),
-    full_disk=(fill_up, "No space left"))
+    ctrl_c=(KeyboardInterrupt, "stopped"),
+    sigterm=(lambda **knobs: signal.raise_signal(signal.SIGTERM), "stopped"),
+    full_disk=(OSError(28, "No space left"), "No space left"))
 def test_a_stop_is_one_sentence(desk, monkeypatch, happens, says):
     make_toy = mock.create_autospec(data_prep.make_toy, side_effect=happens)
     monkeypatch.setattr(data_prep, "make_toy", make_toy)
