@@ -3026,6 +3026,11 @@ def test_resume_keeps_settings_that_are_not_given(command, monkeypatch):
     saved = read_saved()
     assert saved["config"] == asdict(tiny(name="a", mask="on", steps=8))
     assert saved["state"]["step"] == 8
+    (RUN / "film.mp4").touch()
+    (RUN / "metrics.json").unlink()
+    assert command("--resume --name=a") == (0, "")  # a finished run is scored again
+    assert (RUN / "metrics.json").exists()
+    assert (RUN / "film.mp4").exists()
 
 
 def test_a_second_run_leaves_the_first_alone(command):
@@ -3036,15 +3041,6 @@ def test_a_second_run_leaves_the_first_alone(command):
     assert command(f"{FLAGS} --name=b")[0] == 0
     CHECKPOINT.unlink()
     assert_refused(command(FLAGS), "--name")  # there are results
-
-
-def test_a_finished_run_is_scored_again(command):
-    command(FLAGS)
-    (RUN / "film.mp4").touch()
-    (RUN / "metrics.json").unlink()
-    assert command("--resume --name=a") == (0, "")
-    assert (RUN / "metrics.json").exists()
-    assert (RUN / "film.mp4").exists()
 
 
 def hold_lock():
