@@ -209,7 +209,7 @@ def refuses(changes):
 def test_damaged_scene_files_do_no_harm(desk):
     good = zipped(toy())
     directory = good.find(b"PK\1\2")  # the end of the file
-    for at in [*range(0, 300, 9), *range(directory, len(good), 50)]:
+    for at in [*range(0, 300, 3), *range(directory, len(good), 25)]:
         reread(good[:at] + b"9" + good[at + 1:])
     for size in (0, 99, 9999, -99, -9):
         assert reread(good[:size]) is None
@@ -2093,8 +2093,10 @@ def test_the_objective_and_its_gradients_equal_plain_loops(
     model.mask.complexity_quantiles.copy_(torch.tensor([1.0, 6, 20]))
     model.mask.sfm_error.fill_(sfm_error)
     model.mask.place_error.uniform_(0, 0.4)
-    total, log, _ = model.losses(rays, photos, done, generator())
+    total, log, out = model.losses(rays, photos, done, generator())
     plain = plain_losses(model, rays, done)
+    close(out["mask"].mean(), plain["mask"])
+    assert out["mask"][2] == 1  # refinement takes no notice of a person's own mask
     for name, value in log.items():
         close(value, plain[name])
     wanted = plain["rgb"] + model.cfg.lam_mask * plain["reg"]
