@@ -1615,7 +1615,8 @@ def evaluate(model, scene, lpips=None, folder=None):
         row["name"] = name
         rows.append(row)
         if folder:
-            write_png(Path(folder, name + ".png"), to_uint8(np.hstack([truth, rgb])))
+            path = Path(folder, name.removesuffix(".png") + ".png")
+            write_png(path, to_uint8(np.hstack([truth, rgb])))
     scores = dict(per_image=rows)
     for key in ("psnr", "psnr_floor", "ssim", "lpips"):
         values = [row[key] for row in rows if row[key] is not None]
