@@ -16,7 +16,8 @@ The paper's equations
   Eq. 2  compositing weights        composite
   Eq. 3  geometry preservation      gpl_loss
   Eq. 4  edge indicator Phi         edge_indicator, complexity, SDFCache.errors
-  Eq. 5  objective                  objective
+  Eq. 5  objective                  objective, of the losses in GeoNVS.losses:
+         L_eik, L_lps, L_reg        eikonal, lipschitz_loss, mask_loss
 
 Conventions
   world     the foreground is the unit sphere; x * scale + center leads back to SfM units
@@ -28,24 +29,20 @@ Conventions
             finite differences; lap Laplacian; E_grad = (|grad s| - 1)^2; E_curv = |lap s| [D2]
   shapes    R rays, S intervals of a ray (S + 1 samples), P points, N as the line says, L octree
             levels, C channels per level, V feature rows, G inputs of the colour network from
-            geometry, A appearance dims, I photos in all, B of them in a batch, K SfM points, T
+            geometry, A appearance dims, I photos in all, B of them in a batch, Q SfM points, T
             their sightings
 
 Departures from the printed paper; the tag stands at the code
-  [D1]  Eq. 1 is divided by sigmoid(zeta s_i), and s is evaluated at both ends: no beta
-  [D2]  E_curv is |lap s| times the step of the differences (eps in L_curv, a voxel in Phi): at a
-        crease lap s grows as the step shrinks; Phi's sigmoid is calibrated by running quantiles
-  [D3]  L_reg classifies pixels as transient by a threshold on their error; outliers are rejected
-        at first; M has no gradient in L_rgb, and is fixed after 60 % of training
+  [D1]  opacity is NeuS's Eq. 13, from s at both ends of an interval; its colour is their mean
+  [D2]  E_curv is |lap s| times the step; Phi is calibrated by running quantiles, times opacity
+  [D3]  L_reg trains M by a threshold on errors; outliers are rejected early; M is fixed at 60 %
   [D4]  L_lps is a sum of logarithms, not a product
   [D5]  CGNet is reduced to three stages and reads small square photos
   [D6]  the background field also renders what lies before the sphere
-  [D7]  SfM points place the sphere, seed the octree, pull s to zero and keep M at zero; they stand
-        for the off-surface penalty and the sphere loss
-  [D8]  samples and Phi follow a cached SDF; derivatives are taken at one surface point per ray,
-        as they cost five lookups
+  [D7]  SfM points place the sphere, seed the octree, replace off-surface and sphere losses
+  [D8]  samples and Phi follow a cached SDF; derivatives are taken at one surface point a ray
   [D9]  zeta stays between a rising floor and a fixed bound
-  [D10] cells split where colours err and are never pruned; parts that a scene does not need are off
+  [D10] cells split where colours err, none is pruned; parts that a scene does not need are off
 """
 import argparse
 import contextlib
@@ -181,7 +178,7 @@ class Scene(NamedTuple):
     K: Tensor  # (I,4) fx fy cx cy in px
     c2w: Tensor  # (I,3,4)
     near: Tensor  # (I,) smallest useful t
-    points: Tensor  # (K,3) SfM points
+    points: Tensor  # (Q,3) SfM points
     masked: Tensor  # (N,) whether a user's mask file excludes the pixel; (0,) without such files
     thumbs: Tensor  # (I,3,n,n) uint8, whole photos for the mask network
     static: Tensor  # (I,n/2,n/2) mask pixels where SfM points project, some behind outlines [D7]
@@ -196,14 +193,14 @@ def load_scene(raw, device="cpu"):
     side = int(np.clip(np.median(raw["wh"].max(1)) / 2, 64, 256))  # px, half the long side [D5]
     thumbs = [
         cv2.resize(pixels.reshape(h, w, 3), (side, side), interpolation=cv2.INTER_AREA)
-        for pixels, (w, h) in zip(np.split(raw["rgb"], raw["start"][1:]), raw["wh"])]
+        for pixels, (w, h) in zip(np.split(raw["rgb"], raw["start"][1:-1]), raw["wh"])]
     n = side // 2
     uv = raw["track_uv"]  # (T,2)
     is_seen = ((uv >= 0) & (uv < 1)).all(1)  # (T,) the point lies in the picture
     col, row = (uv[is_seen] * n).astype(int).T
     static = np.zeros((len(thumbs), n, n), bool)
     static[raw["track_photo"][is_seen], row, col] = True
-    arrays = [raw[key] for key in Scene._fields[:7]]
+    arrays = [raw[key] for key in Scene._fields[:7]]  # the file has these under the same names
     arrays.append(raw.get("masked", np.zeros(0, bool)))
     arrays += [np.moveaxis(thumbs, 3, 1), static]
     is_test = raw["is_test"]
@@ -293,7 +290,7 @@ def sphere_interval(rays):
 
 ROOT = 16  # cells of the coarsest level along an axis
 MAX_CELLS = 8_000_000  # of the foreground: about 1 GB with Adam's moments, more while refining
-SPLIT_SHARE = 0.8  # of the recorded error lies in the cells that a refinement splits
+SPLIT_SHARE = 0.8  # a refinement splits the worst cells, which hold this share of the error
 
 
 def trilinear_weights(f):
@@ -379,7 +376,8 @@ class Octree(nn.Module):
             cells.append(F.pad(index, (1, 0), value=level))  # (N,4) level, i, j, k
             is_split.append(torch.isin(pack_index(cells[level]), split_keys))  # (N,)
             parents = index[is_split[level]]
-            index = (2 * parents[:, None] + octants).flatten(0, 1)  # eight children follow each
+            index = (2 * parents[:, None] + octants).flatten(0, 1)  # in the order of octants
+        # levels follow one another in cells: the k-th split cell has the k-th eight children
         cells = torch.cat(cells)
         is_split = torch.cat(is_split)
         first_child = self.root**3 + 8 * (is_split.cumsum(0) - 1)  # (N,)
@@ -397,17 +395,17 @@ class Octree(nn.Module):
         self.child = nn.Buffer((first_child * is_split).int(), persistent=False)  # (N,) 0: none
         self.corner = nn.Buffer(row[corner].int(), persistent=False)  # (N,8) rows
         self.is_hanging = nn.Buffer(~has_feature[corner], persistent=False)  # (N,8)
-        # (N,3) of rays that end in a cell, sums of: error, size of a pixel there, 1
+        # (N,3) sums over the rays that end in a cell: of errors, of pixel sizes there, their number
         self.cell_error = nn.Buffer(self.features.new_zeros(len(cells), 3))
         self.finest = 2 * self.half / (self.root * 2 ** cells[-1, 0].item())  # smallest cell's side
         return is_old
 
     def locate(self, x):
-        """Where points x (P,3) lie in each level: the row in cells (P,L) of the finest cell around x
-        down to that level; whether the level has a cell there (P,L); the position in it, 0..1
+        """Where points x (P,3) lie in each level: the row in cells (P,L) of the finest cell around
+        x down to that level; whether the level has a cell there (P,L); the position in it, 0..1
         (P,L,3). An x outside the cube is moved to its border."""
         x = 0.5 + x * (0.5 / self.half)  # (P,3) over the cube
-        x = x.clamp(0, 1 - 1e-6).nan_to_num()  # `report` ends a run that diverges
+        x = x.clamp(0, 1 - 1e-6).nan_to_num()  # check_finite ends a run that diverges
         x = x[:, None] * self.resolution[:, None]  # (P,L,3) in cells
         index = x.long()  # (P,L,3)
         octants = pack_index(index & 1, base=2)  # (P,L)
@@ -448,9 +446,9 @@ def in_chunks(function, x):
 
 
 def seed_octree(octree, points, dense):
-    """Splits the first `dense` levels everywhere, two more, if there are as many, around points
-    (P,3), neighbours too, so that no corner of a point's cell is hanging; then random features.
-    [D7]"""
+    """Splits every cell of the first `dense` levels; then twice, if there are as many levels, the
+    cell of each point of points (P,3) and its 26 neighbours, so that no corner of that cell is
+    hanging. Features are then drawn at random. [D7]"""
     for _ in range(dense):
         octree.split(octree.cells)
     neighbours = F.pad(grid_index(3, points.device) - 1, (1, 0))  # (27,4)
@@ -462,8 +460,9 @@ def seed_octree(octree, points, dense):
 
 
 def cells_to_split(octree):
-    """The cells (N,4) with the largest errors: together SPLIT_SHARE of what is recorded in cells
-    whose children are no finer than a pixel. Rays end in cells that are not split. [D10]"""
+    """Cells (N,4) to split: those with the largest summed errors, until they hold SPLIT_SHARE of
+    it. Only cells whose children would be larger than a pixel count. Errors are recorded in cells
+    that are not split. [D10]"""
     level = octree.cells[:, 0]  # (N,)
     error, pixel, count = octree.cell_error.T  # (N,) sums over rays
     is_coarse = pixel < count * octree.side[level] / 2  # mean size of a pixel under a child's side
@@ -478,7 +477,7 @@ def cells_to_split(octree):
 # ---- 4 Fields: the networks on top of the octree -------------------------------------------------
 
 GEOMETRY_FEATURES = 15  # that the SDF network hands to the colour network
-START_RADIUS = 0.25  # of the sphere that s starts as; it grows to the landmark [D7]
+START_RADIUS = 0.25  # of the sphere that s starts as, inside the landmark to which it grows [D7]
 
 
 @functools.cache
@@ -525,6 +524,7 @@ def finite_differences(s, taps, eps):
     """Gradient (P,3) and Laplacian (P,) of a field from its values s (P,5) at x + eps taps: x
     itself, then the corners of a tetrahedron (Neuralangelo's code; its paper has six)."""
     grad = 3 / (4 * eps) * (s @ taps)  # (P,3) as the sum of k k^T over corners k is 4/3 I
+    # the mean over a sphere of radius eps is s + eps^2 lap / 6
     lap = 6 / eps**2 * (s[:, 1:].mean(1) - s[:, 0])
     return grad, lap
 
@@ -588,8 +588,10 @@ UNIFORM_SHARE = 0.25  # weight of evenly spread samples, so that a lost surface 
 
 def neus_alpha(sdf, zeta):
     """Opacity (R,S) of the intervals between samples with SDF (R,S+1). Eq. 1 corrected: alpha_i =
-    max(0, 1 - sigmoid(zeta s_{i+1}) / sigmoid(zeta s_i)), which is NeuS Eq. 13. As printed, without
-    the division, a surface is 63 % opaque; with s at both ends no slope beta is needed. [D1]"""
+    max(0, 1 - sigmoid(zeta s_{i+1}) / sigmoid(zeta s_i)), which is NeuS Eq. 13. In the paper's
+    form, without the division, the opacities of a crossing sum to 1, so that many samples let
+    exp(-1) of the light through: 63 % are absorbed. With s at both ends no slope beta is needed.
+    [D1]"""
     log_phi = F.logsigmoid(zeta * sdf)  # (R,S+1), which does not overflow
     fall = log_phi.diff().clamp_max(0)  # (R,S) 0 where the ray leads outwards
     return -fall.expm1()
@@ -622,8 +624,8 @@ def stratified(jitter):
 
 
 class SDFCache(nn.Module):
-    """s, E_grad and E_curv on a dense grid, a little old: where along a ray samples pay [D8], and
-    how complex the geometry along it is (Eq. 4)."""
+    """s, E_grad and E_curv on a dense grid that is refreshed every CACHE_EVERY steps. It guides
+    where samples lie along a ray [D8] and gives the complexity of the geometry along it (Eq. 4)."""
     def __init__(self, n):
         super().__init__()
         self.n = n
@@ -640,8 +642,8 @@ class SDFCache(nn.Module):
 
     def refresh(self, sdf, turn=None):
         """Evaluates sdf, (P,3) to (P,), again. turn None: at every voxel in the sphere. turn k: at
-        the eighth of them that is nearest to the surface, and at every eighth voxel from k % 8 on,
-        so that eight turns cover all."""
+        the eighth of them with the smallest |s|, and at voxels k % 8, k % 8 + 8, ... of all, so
+        that eight turns cover them."""
         s = self.volume[0, 0].flatten()  # (n^3,)
         chosen = [self.inside]
         if turn is not None:
@@ -680,16 +682,17 @@ class SDFCache(nn.Module):
         return self.lookup(x, slice(1, 3)).mean(2)
 
     @torch.no_grad()
-    def sample(self, rays, t0, t1, jitter, alpha):
+    def sample(self, rays, t0, t1, jitter, alpha_of):
         """Distances (R,S+1) from t0 to t1 (R,1), dense where a surface is seen. jitter: (R,S-1) in
-        0..1, of the stratified samples between the ends; alpha: GeoNVS.alpha."""
+        0..1, of the stratified samples between the ends; alpha_of: GeoNVS.alpha. N = PROBES"""
         even = torch.linspace(0, 1, PROBES + 1, device=t0.device)
         probes = t0.lerp(t1, even)  # (R,N+1)
         sdf = self.sdf(rays.at(probes))  # (R,N+1)
-        alphas = alpha(sdf, probes, max_zeta=self.n)  # (R,N) surfaces at least half a voxel wide
-        weight = composite(alphas)
+        alpha = alpha_of(sdf, probes, max_zeta=self.n)  # (R,N) surfaces at least half a voxel wide
+        weight = composite(alpha)
         uniform_weight = UNIFORM_SHARE * weight.mean(1, keepdim=True)
-        inner = inverse_cdf(probes, weight + uniform_weight + 1e-5, stratified(jitter))
+        weight = weight + uniform_weight + 1e-5  # an empty ray has uniform samples
+        inner = inverse_cdf(probes, weight, stratified(jitter))
         return torch.cat([t0, inner, t1], 1)
 
 
@@ -716,24 +719,26 @@ class Background(nn.Module):
     """A small NeRF before the sphere and beyond it, on an octree over contracted space. [D6]"""
     def __init__(self, points, hidden, extra, levels):
         super().__init__()
-        self.octree = Octree(2.0, levels, root=32)
+        self.octree = Octree(2.0, levels, root=32)  # cells of 1/8
         seed_octree(self.octree, contract(points), dense=levels - 3)  # (N,3)
         self.density = mlp(3 + self.octree.width, hidden, 1 + GEOMETRY_FEATURES)
         self.color = mlp(GEOMETRY_FEATURES + extra, hidden, 3)
 
     def forward(self, rays, t0, t1, per_ray, jitter):
-        """Returns near_color (R,3), of what lies before t0 (R,1); near_transmittance (R,1);
-        far_color (R,3), of what lies beyond t1 (R,1), seen through what lies before t0; and
-        far_place (R,3), where that is on average in contracted space. per_ray: (R,3+A) direction
-        and code; jitter (R,S) in 0..1, here S background samples. A sixth of them lies evenly
-        before the sphere; the others are even in u, at a distance u / (1 - u) behind it. The last
-        is opaque."""
+        """Renders what lies around the foreground. per_ray: (R,3+A) direction and code; jitter:
+        (R,S) in 0..1, where S counts background samples. The first n = S // 6 are evenly spaced
+        from near to t0 (R,1); the others lie u / (1 - u) behind t1 (R,1), with u even in 0..1. The
+        last one is opaque. Returns
+            near_color          (R,3)  of what lies before t0
+            near_transmittance  (R,1)  up to t0
+            far_color           (R,3)  of what lies behind t1, dimmed by what lies before t0
+            far_place           (R,3)  its mean position, in contracted space"""
         _, S = jitter.shape
         n = S // 6
         number = torch.arange(S, device=t0.device) + jitter  # (R,S)
         near = rays.near.lerp(t0, number[:, :n] / n)  # (R,n)
         u = (number[:, n:] - n) / (S - n)  # (R,S-n)
-        far = u / (1 - u).clamp_min(1e-3)
+        far = u / (1 - u).clamp_min(1e-3)  # at most 1,000 radii away
         near_length = torch.cat([near, t0], 1).diff()  # (R,n)
         length = torch.cat([near_length, far.diff()], 1)  # (R,S-1)
         t = torch.cat([near, t1 + far], 1)  # (R,S)
@@ -742,7 +747,7 @@ class Background(nn.Module):
         out = mixed_precision(self.density, inputs)  # (R,S,1+GEOMETRY_FEATURES)
         sigma, geo = out.split([1, GEOMETRY_FEATURES], 2)
         rgb = colors_of(self.color, geo, per_ray)  # (R,S,3)
-        sigma = F.softplus(sigma[..., 0] - 1)  # (R,S)
+        sigma = F.softplus(sigma[..., 0] - 1)  # (R,S) starts at 0.31
         alpha = 1 - torch.exp(-sigma[:, :-1] * length)  # (R,S-1)
         w = composite(F.pad(alpha, (0, 1), value=1.0))  # (R,S)
         near_w, far_w = w.split([n, S - n], 1)
@@ -760,7 +765,7 @@ def render_rays(model, rays, code, random, points):
         code     (R,A)    appearance
         random   (R,.)    in 0..1, places samples: S - 1 of the foreground, then the background's
         points   (N,3)    more points at which derivatives are taken
-    Returns a dictionary. Depth and points have no gradient.
+    Returns a dictionary. depth, surface_point and place have no gradient.
         rgb            (R,3)
         opacity        (R,)      of the foreground
         is_solid       (R,)      whether the foreground covers more than half of the ray
@@ -769,7 +774,7 @@ def render_rays(model, rays, code, random, points):
         place          (R,3)     where the ray ends, in contracted space: there or on the background
         normal         (R,3)     at the surface point, times opacity
         e_grad         (R+N,)    E_grad at surface points, then at points
-        e_curv         (R,)      E_curv at surface points
+        e_curv         (R,)      E_curv at surface points, times opacity
         sdf            (N,)      at points
         ray_e_grad, ray_e_curv  (R,)  averages along the ray"""
     fg_random, bg_random = random.tensor_split([model.cfg.samples - 1], 1)
@@ -779,20 +784,21 @@ def render_rays(model, rays, code, random, points):
     sdf, geo = model.sdf(x)  # (R,S+1), (R,S+1,G)
     w = composite(model.alpha(sdf, t))  # (R,S)
     opacity = w.sum(1)  # (R,)
-    w = F.pad(w, (1, 1))
-    w = 0.5 * (w[:, :-1] + w[:, 1:])  # (R,S+1) an interval has the mean colour of its ends [D1]
+    # an interval has the mean colour of its ends, so each of them gets half of its weight [D1]
+    w = F.pad(w, (1, 1))  # (R,S+2)
+    w_sample = 0.5 * (w[:, :-1] + w[:, 1:])  # (R,S+1)
 
-    hit = w.detach()
+    hit = w_sample.detach()
     depth = ((hit * t).sum(1) + 1e-3 * t1[:, 0]) / (hit.sum(1) + 1e-3)  # (R,) t1 if it hits nothing
     surface_point = rays.at(depth[:, None])[:, 0]  # (R,3)
     R = len(depth)
-    points = torch.cat([surface_point, points])  # (R+N,3), as one lookup is faster than two
-    s, grad, lap = model.sdf.derivatives(points, model.eps)  # (R+N,), (R+N,3), (R+N,) [D8]
+    taken_at = torch.cat([surface_point, points])  # (R+N,3), as one lookup is faster than two
+    s, grad, lap = model.sdf.derivatives(taken_at, model.eps)  # (R+N,), (R+N,3), (R+N,) [D8]
     normal = F.normalize(grad[:R])
 
     per_ray = torch.cat([rays.d, code], 1)  # (R,3+A)
     rgb = colors_of(model.color, geo, torch.cat([normal, per_ray], 1))  # (R,S+1,3)
-    rgb = torch.einsum("rs,rsc->rc", w, rgb)  # (R,3)
+    rgb = torch.einsum("rs,rsc->rc", w_sample, rgb)  # (R,3)
     far_color = model.bg_color  # (3,)
     far_place = 2 * rays.d  # (R,3) infinity
     if model.background:
@@ -825,7 +831,7 @@ MIN_THRESHOLD = 0.15  # no smaller error makes a pixel transient
 PLACE_CELLS = 32  # along an axis, of the table of errors over contracted space
 PLACE_QUANTILE = 0.2  # of the errors at a place in all photos; low, so that people hardly raise it
 PLACE_FACTOR = 1.5  # an error up to so many times that quantile is usual for the place
-QUANTILE_RATE = 0.1  # how fast running quantiles move, as a logarithm per step
+QUANTILE_RATE = 0.1  # the most by which a running quantile's logarithm moves in a step
 
 
 def complexity(e_grad, e_curv):
@@ -833,14 +839,15 @@ def complexity(e_grad, e_curv):
     return LAMBDA_GRAD * e_grad + LAMBDA_CURV * e_curv
 
 
-def edge_indicator(complexity, opacity, quantiles):
-    """Phi (R,): the calibrated sigmoid of Eq. 4, times opacity. It is 0.5 at the upper quartile of
-    the complexity of rays that end on the foreground; quantiles (3,): the median, that quartile and
-    95 %. A plain sigmoid is at least 0.5 on every ray, which protects all alike; a ray through air
-    has no edge. [D2]"""
+def edge_indicator(values, opacity, quantiles):
+    """Phi (R,), Eq. 4: a calibrated sigmoid of the complexity, times opacity. The sigmoid is 0.5 at
+    the upper quartile of the complexity of foreground rays; its width is a quarter of the range
+    from their median to their 95 % quantile. quantiles (3,): 50, 75, 95 %. Complexity is never
+    negative, so that a plain sigmoid is at least 0.5 on every ray and protects all alike; and a ray
+    through air has no edge, hence the opacity. [D2]"""
     p50, p75, p95 = quantiles
     width = ((p95 - p50) / 4).clamp_min(1e-3)
-    return opacity * torch.sigmoid((complexity - p75) / width)
+    return opacity * torch.sigmoid((values - p75) / width)
 
 
 def gpl_loss(mask, phi):
@@ -850,26 +857,28 @@ def gpl_loss(mask, phi):
 
 
 def mask_loss(logit, excess):
-    """L_reg: classification of rays (R,) by their error. Rays whose error exceeds the threshold by
-    excess (R,) are trained towards M = 1, those below it towards M = 0, weighted by the difference.
-    The same M minimises (1 - M) error + M threshold, but the gradient of that vanishes where the
-    sigmoid is flat; terms for intensity and bimodality, as printed, mask all or nothing. [D3]"""
+    """L_reg: binary cross entropy that classifies rays (R,) by their error. A ray whose error
+    exceeds its threshold (excess > 0) is trained towards M = 1, any other towards M = 0, weighted
+    by |excess|. The same M minimises (1 - M) error + M threshold, but the gradient of that vanishes
+    where the sigmoid saturates. The paper's penalties for intensity and bimodality made M all 0 or
+    all 1. [D3]"""
     is_transient = (excess > 0).float()
     return F.binary_cross_entropy_with_logits(logit, is_transient, excess.abs())
 
 
 def reject_outliers(mask, is_outlier, done):
-    """M (R,), but 1 for outliers, rays whose error exceeds the threshold, if M exceeds a confidence
-    threshold. That rises from 0 to 1 early in training: at first the scene must not learn to paint
-    people, later it must learn its details. [D3]"""
+    """M (R,) with outliers, rays whose error exceeds the threshold, set to 1 where M exceeds a
+    confidence. It rises from 0 to 1 over the first REJECTION of training; then nothing is rejected.
+    Early the scene must not learn people, later it must learn its own details. [D3]"""
     confidence = (done / REJECTION) ** 2
     return torch.where(is_outlier & (mask > confidence), 1.0, mask)
 
 
 def update_running_quantiles(running, level, group, values, is_chosen):
-    """Moves running quantiles (N,), above 0, by a factor towards the quantile `level`, a float or
-    (P,), of the chosen values (P,) of each group, an index (P,) into N: up where too many values
-    lie above it."""
+    """Moves running quantiles of positive numbers, in place. running (N,): one a group; level:
+    which quantile, a float or (P,); group (P,): index into running; values (P,), of which those
+    count that are chosen (P,). A quantile grows while more than a share 1 - level of its values
+    exceeds it."""
     is_below = values < running[group]  # (P,)
     excess = (level - is_below.float()) * is_chosen
     total = torch.zeros_like(running).index_add_(0, group, excess)
@@ -927,10 +936,12 @@ class TransientMask(nn.Module):
             nn.Sequential(conv(3, 16, stride=2), conv(16, 16, stride=1)),
             ContextBlock(16, dilation=2),
             ContextBlock(32, dilation=4))
+        # one bias, as logits are summed
         self.heads = nn.ModuleList(nn.Conv2d(n, 1, 1, bias=n == 16) for n in (16, 32, 64))
         nn.init.constant_(self.heads[0].bias, -2.5)  # starts with 8 % masked, not with half
         self.thumbs = nn.Buffer(scene.thumbs, persistent=False)
-        self.levels = nn.Buffer(torch.tensor([0.5, 0.75, 0.95]), persistent=False)
+        self.quantile_levels = nn.Buffer(torch.tensor([0.5, 0.75, 0.95]), persistent=False)
+        # first guesses
         self.complexity_quantiles = nn.Buffer(torch.tensor([0.5, 1.0, 4.0]))  # (3,)
         self.place_error = nn.Buffer(torch.full((PLACE_CELLS**3,), 0.1))  # lower quantile
 
@@ -957,7 +968,7 @@ class TransientMask(nn.Module):
         of_three = torch.arange(3, device=error.device).repeat_interleave(R)  # (3R,)
         update_running_quantiles(
             self.complexity_quantiles,
-            self.levels[of_three],
+            self.quantile_levels[of_three],
             of_three,
             out["complexity"].repeat(3),
             out["is_solid"].repeat(3))
@@ -968,8 +979,8 @@ class TransientMask(nn.Module):
 # ---- 7 The model and its objective ---------------------------------------------------------------
 
 START_ZETA = 20
-ZETA_FLOOR = 15, 80  # at first, and after ZETA_RISE of training [D9]
-ZETA_RISE = 0.43
+ZETA_FLOOR = 15, 80  # lower bound of zeta at first, and from ZETA_RISE of training on [D9]
+ZETA_RISE = 0.43  # until then surfaces are soft, and the cache is coarse
 MAX_PULL = 40  # zeta up to which SfM points pull harder
 NEAR_SFM = 0.1  # half the side of the cubes around SfM points in which L_eik is taken, too
 CACHE_EVERY = 64  # steps between renewals of the cache
@@ -1011,8 +1022,8 @@ def objective(loss, cfg):
 
 
 class GeoNVS(nn.Module):
-    """The paper's model: the parts above, and their losses. Make it under torch.device(the
-    scene's)."""
+    """The paper's model: the parts above, and their losses. Made under `with device:`, so that all
+    its tensors lie on the scene's device."""
     name = "geonvsw"
 
     def __init__(self, cfg, scene):
@@ -1043,7 +1054,8 @@ class GeoNVS(nn.Module):
         self.bg_color = nn.Buffer(bg_color, persistent=False)
         if has_background:
             outside = scene.points[~is_inside]
-            self.background = Background(outside, cfg.hidden, 3 + A, min(levels, 4))
+            bg_levels = min(levels, 4)  # at most 256 cells across
+            self.background = Background(outside, cfg.hidden, 3 + A, bg_levels)
             self.octrees.append(self.background.octree)
         self.deviation = nn.Parameter(torch.tensor(math.log(START_ZETA) / 10))
         self.mask = TransientMask(scene)
@@ -1057,12 +1069,13 @@ class GeoNVS(nn.Module):
         return self.sdf.octree.finest / 2
 
     def zeta(self):
-        """The deviation network: one learned number; 1 / zeta is the width of a surface."""
+        """The deviation network: one learned number v, zeta = exp(10 v) as in NeuS's code; 1 / zeta
+        is the width of a surface."""
         return torch.exp(10 * self.deviation)
 
     def alpha(self, sdf, t, max_zeta=math.inf):
-        """Opacity (R,S) of the intervals between samples at t (R,S+1) with SDF (R,S+1). A density
-        would need t."""
+        """Opacity (R,S) of the intervals between samples at t (R,S+1) with SDF (R,S+1). t is there
+        for fields that need lengths, as the density in test_geonvs.py does."""
         return neus_alpha(sdf, self.zeta().clamp_max(max_zeta))
 
     def distance(self, x):
@@ -1071,35 +1084,19 @@ class GeoNVS(nn.Module):
 
     def losses(self, rays, photos, done, gen):
         """The objective of rays that come photo by photo, equally many of each of photos (B,);
-        done: share of training, 0..1. Returns the total; raw losses by name, and more for the log;
-        what update_statistics learns from."""
+        done: share of training, 0..1. Returns the total; a dictionary of its losses and more for
+        the log; the output of render_rays, and what else update_statistics needs."""
         cfg = self.cfg
         R = len(rays.o)
         code = self.appearance(photos).repeat_interleave(R // len(photos), 0)  # (R,A)
         random = uniform(gen, R, self.random_per_ray)
         sfm = self.sfm[random_index(gen, len(self.sfm), math.ceil(R / 4))]  # (N,3)
         near_sfm = sfm + NEAR_SFM * (2 * uniform(gen, *sfm.shape) - 1)  # (N,3)
-        out = render_rays(self, rays, code, random, torch.cat([sfm, near_sfm]))
+        points = torch.cat([sfm, near_sfm])  # (2N,3): s is 0 at the first N, L_eik is taken at all
+        out = render_rays(self, rays, code, random, points)
         residual = (out["rgb"] - rays.rgb).abs()  # (R,3)
         error = residual.detach().amax(1)  # (R,) of the worst channel
-
-        ray_complexity = complexity(out["ray_e_grad"], out["ray_e_curv"])  # (R,)
-        opacity = out["opacity"].detach()
-        phi = edge_indicator(ray_complexity, opacity, self.mask.complexity_quantiles)  # (R,)
-        reg = error.new_zeros(())
-        gpl = error.new_zeros(())
-        mask = torch.zeros_like(error)
-        if cfg.mask != "off":
-            logit = sample_logits(self.mask.logits(photos), rays.uv)  # (R,)
-            if done >= MASK_TRAINING:
-                logit = logit.detach()
-            M = logit.sigmoid()
-            # SfM pixels count as if they had no error: they train M = 0 [D7]
-            excess = error * ~rays.is_static - self.mask.threshold(out["place"])
-            reg = mask_loss(logit, excess * ~rays.is_masked)
-            gpl = gpl_loss(M, phi * ~rays.is_masked)
-            mask = reject_outliers(M.detach(), excess > 0, done)
-        mask = mask.masked_fill(rays.is_masked, 1)
+        mask, reg, gpl, values = self.transients(rays, photos, out, error, done)
 
         pull = self.zeta().detach().clamp_max(MAX_PULL)  # at first s must be free to change [D7]
         loss = dict(
@@ -1114,18 +1111,40 @@ class GeoNVS(nn.Module):
         log = loss | dict(
             mse=residual.square().mean(),
             mask=mask.mean())  # rejected rays count as 1
-        out |= dict(error=error, mask=mask, complexity=ray_complexity)
+        out |= dict(error=error, mask=mask, complexity=values)
         return total, log, out
 
+    def transients(self, rays, photos, out, error, done):
+        """Section 6 for rays with out of render_rays and errors (R,). Returns what L_rgb leaves out
+        (R,): M, or 1 for rejected outliers and for pixels that a user's mask excludes; L_reg;
+        L_GPL; the complexity (R,) along the rays."""
+        values = complexity(out["ray_e_grad"], out["ray_e_curv"])  # (R,)
+        opacity = out["opacity"].detach()
+        phi = edge_indicator(values, opacity, self.mask.complexity_quantiles)  # (R,)
+        reg = error.new_zeros(())
+        gpl = error.new_zeros(())
+        left_out = torch.zeros_like(error)
+        if self.cfg.mask != "off":
+            logit = sample_logits(self.mask.logits(photos), rays.uv)  # (R,)
+            if done >= MASK_TRAINING:
+                logit = logit.detach()
+            M = logit.sigmoid()
+            # SfM pixels count as if they had no error: they train M = 0 [D7]
+            excess = error * ~rays.is_static - self.mask.threshold(out["place"])
+            reg = mask_loss(logit, excess * ~rays.is_masked)
+            gpl = gpl_loss(M, phi * ~rays.is_masked)
+            left_out = reject_outliers(M.detach(), excess > 0, done)
+        return left_out.masked_fill(rays.is_masked, 1), reg, gpl, values
+
     def before_step(self, step, done):
-        """Renews the cache, and keeps zeta within bounds. Its floor rises with training (done:
-        0..1): soft surfaces hide people from the mask, and people in the picture keep surfaces
-        soft. The other bound is a surface of 1/64 of an even interval between samples; no gradient
-        would move a thinner one. [D9]"""
+        """Keeps zeta within bounds and renews the cache. The floor of zeta rises with training
+        (done: 0..1): while surfaces are soft the model can paint people, so that they have small
+        errors and are not masked, and then surfaces stay soft. The upper bound is a width 1 / zeta
+        of 1/64 of an even interval, 2 / S; thinner surfaces get no gradient. [D9]"""
         start, end = ZETA_FLOOR
         floor = start + (end - start) * min(done / ZETA_RISE, 1.0)
-        most = 32 * self.cfg.samples
-        self.deviation.data.clamp_(math.log(floor) / 10, math.log(most) / 10)
+        upper = 32 * self.cfg.samples
+        self.deviation.data.clamp_(math.log(floor) / 10, math.log(upper) / 10)
         if step % CACHE_EVERY == 0:
             if done < ZETA_RISE:
                 self.cache.refresh_coarse(self.distance)
@@ -1458,7 +1477,8 @@ def train(cfg, scene, run, saved=None):
             if RANK == 0 and (is_last or state.seconds >= next_log):
                 next_log = state.seconds + PAUSE
                 state.joules = next(meter, None)  # None, never 0, once a counter has failed
-                report(model, run / "log.jsonl", done, state, terms)
+                check_finite(model, run)
+                report(run / "log.jsonl", done, state, terms)
                 save_checkpoint(run / "checkpoint.pt", model, optimizer, gen, state)
     if is_stopped or signals:
         raise KeyboardInterrupt(
@@ -1483,11 +1503,15 @@ def rewind_log(path, step):
     atomic_write(path, lambda part: part.write_text("".join(kept)))
 
 
-def report(model, path, done, state, terms):
-    """A line on the terminal and one in log.jsonl. psnr: of the step's rays, people included."""
+def check_finite(model, run):
+    """Ends a run that diverges, before its checkpoint is replaced."""
     check(all(p.isfinite().all() for p in model.parameters()),
           "weights are no longer finite: correct the poses, or try a third of the learning rates "
-          f"--lr_grid and --lr_net; checkpoint.pt beside {path}, if any, is from before")
+          f"--lr_grid and --lr_net; checkpoint.pt in {run}, if any, is from before")
+
+
+def report(path, done, state, terms):
+    """A line on the terminal and one in log.jsonl. psnr: of the step's rays, people included."""
     numbers = {key: value.item() for key, value in terms.items()}
     numbers["psnr"] = -10 * math.log10(numbers["mse"] + 1e-10)
     with open(path, "a") as file:
@@ -1630,8 +1654,9 @@ def mask_mean(mask, chosen):
 
 
 def depth_edges(depth):
-    """Whether a pixel of depth (H,W) lies beside a jump: there inverse depth, which is linear on a
-    plane, bends by 5 % or more between the pixel's neighbours."""
+    """Whether a pixel of depth (H,W), distances along rays, lies beside a jump: the second
+    difference of inverse depth, nearly 0 on a plane, is 5 % of the largest of the three pixels or
+    more."""
     inverse = 1 / depth.astype(np.float32)  # 0: sky
     edges = np.zeros(depth.shape, bool)
     for q, is_edge in (inverse, edges), (inverse.T, edges.T):  # down, then across
