@@ -15,7 +15,7 @@ The paper's equations
   Eq. 1  opacity of an interval     neus_alpha
   Eq. 2  compositing weights        composite
   Eq. 3  geometry preservation      gpl_loss
-  Eq. 4  edge indicator Phi         edge_indicator, complexity, SDFCache.errors
+  Eq. 4  edge indicator Phi         edge_indicator, complexity, SDFCache.errors, central_differences
   Eq. 5  objective                  objective, of the losses in GeoNVS.losses:
          L_eik, L_lps, L_reg        eikonal, lipschitz_loss, mask_loss
 
@@ -33,16 +33,19 @@ Conventions
             their sightings
 
 Departures from the printed paper; the tag stands at the code
-  [D1]  opacity is NeuS's Eq. 13, from s at both ends of an interval; its colour is their mean
-  [D2]  E_curv is |lap s| times the step; Phi is calibrated by running quantiles, times opacity
-  [D3]  L_reg trains M by a threshold on errors; outliers are rejected early; M is fixed at 60 %
-  [D4]  L_lps is a sum of logarithms, not a product
-  [D5]  CGNet is reduced to three stages and reads small square photos
+  [D1]  alpha is NeuS's Eq. 13: never negative, no beta; an interval has the mean colour of its ends
+  [D2]  E_curv is |lap s| times the step; Phi follows running quantiles; opacity weighs both
+  [D3]  L_reg classifies by error, no intensity, no bimodality; early rejection; M fixed at 60 %
+  [D4]  L_lps is a sum of logarithms, not a product; a layer's bound is exp(c), not softplus(c)
+  [D5]  CGNet has a block a stage, GroupNorm, a head at each resolution, and reads small photos
   [D6]  the background field also renders what lies before the sphere
-  [D7]  SfM points place the sphere, seed the octree, replace off-surface and sphere losses
-  [D8]  samples and Phi follow a cached SDF; derivatives are taken at one surface point a ray
+  [D7]  SfM points place the sphere, seed the octree, pull s and M to 0; s starts as a small sphere;
+        no off-surface penalty, no sphere loss, no warm-up
+  [D8]  samples and Phi follow a cached SDF, so L_GPL moves M alone; derivatives are taken at SfM
+        points and at one surface point a ray, whose normal its colours share
   [D9]  zeta stays between a rising floor and a fixed bound
-  [D10] cells split where colours err, none is pruned; parts that a scene does not need are off
+  [D10] cells split where colours err, none is pruned, the background's stay as seeded; parts that a
+        scene does not need are off
 """
 import argparse
 import contextlib
@@ -181,7 +184,7 @@ class Scene(NamedTuple):
     points: Tensor  # (Q,3) SfM points
     masked: Tensor  # (N,) whether a user's mask file excludes the pixel; (0,) without such files
     thumbs: Tensor  # (I,3,n,n) uint8, whole photos for the mask network
-    static: Tensor  # (I,n/2,n/2) mask pixels where SfM points project, some behind outlines [D7]
+    static: Tensor  # (I,n/2,n/2) mask pixels in which the photo saw an SfM point [D7]
     train: Tensor  # (.,) indices of the training photos
     test: Tensor  # (.,) indices of the held-out photos
     raw: dict  # the file in numpy: names, statistics, center, scale, ground truth of the toy
@@ -190,11 +193,11 @@ class Scene(NamedTuple):
 
 def load_scene(raw, device="cpu"):
     """Scene from the dictionary of a scene file (data_prep.open_scene, make_toy or prepare)."""
-    side = int(np.clip(np.median(raw["wh"].max(1)) / 2, 64, 256))  # px, half the long side [D5]
+    n = int(np.clip(np.median(raw["wh"].max(1)) / 4, 32, 128))  # px of the mask
+    side = 2 * n  # px, half of a photo's long side [D5]
     thumbs = [
         cv2.resize(pixels.reshape(h, w, 3), (side, side), interpolation=cv2.INTER_AREA)
         for pixels, (w, h) in zip(np.split(raw["rgb"], raw["start"][1:-1]), raw["wh"])]
-    n = side // 2
     uv = raw["track_uv"]  # (T,2)
     is_seen = ((uv >= 0) & (uv < 1)).all(1)  # (T,) the point lies in the picture
     col, row = (uv[is_seen] * n).astype(int).T
@@ -382,7 +385,7 @@ class Octree(nn.Module):
         is_split = torch.cat(is_split)
         first_child = self.root**3 + 8 * (is_split.cumsum(0) - 1)  # (N,)
         corners = pack_index(cells[:, None] + F.pad(octants, (1, 0)))  # (N,8) keys
-        key, corner, cells_around = corners.unique(return_inverse=True, return_counts=True)
+        key, corner, cells_around = corners.unique(return_inverse=True, return_counts=True)  # (.,)
         has_feature = cells_around == 8
         row = (has_feature.cumsum(0) - 1).clamp_min(0)  # of a corner's feature; any, where hanging
         key = key[has_feature]  # (V,)
@@ -391,7 +394,7 @@ class Octree(nn.Module):
         self.split_keys = nn.Buffer(split_keys, persistent=False)
         self.corner_key = nn.Buffer(key, persistent=False)  # (V,) sorted, the corner of each row
         self.features = nn.Parameter(carry_over_rows(self.features, is_old))
-        self.cells = nn.Buffer(cells, persistent=False)
+        self.cells = nn.Buffer(cells, persistent=False)  # (N,4) level, i, j, k
         self.child = nn.Buffer((first_child * is_split).int(), persistent=False)  # (N,) 0: none
         self.corner = nn.Buffer(row[corner].int(), persistent=False)  # (N,8) rows
         self.is_hanging = nn.Buffer(~has_feature[corner], persistent=False)  # (N,8)
@@ -553,7 +556,7 @@ class SDFField(nn.Module):
         feat = self.octree(x)  # (...,LC)
         out = self.network(torch.cat([x, feat], -1))  # (...,1+GEOMETRY_FEATURES)
         offset, geo = out.split([1, GEOMETRY_FEATURES], -1)
-        sdf = x.norm(dim=-1) - START_RADIUS + offset.squeeze(-1)  # (...)
+        sdf = x.norm(dim=-1) - START_RADIUS + offset.squeeze(-1)  # (...) [D7]
         return sdf, torch.cat([geo, feat], -1)
 
     def derivatives(self, x, eps):
@@ -564,7 +567,7 @@ class SDFField(nn.Module):
 
 class LipschitzLinear(nn.Linear):
     """A layer whose rows are scaled to an L1 norm of at most exp(c), with c learned: its Lipschitz
-    bound in the max norm (Liu et al. 2022, who have softplus for exp)."""
+    bound in the max norm (Liu et al. 2022, who have softplus for exp). [D4]"""
     def __init__(self, inputs, outputs):
         super().__init__(inputs, outputs)
         self.c = nn.Parameter(self.weight.abs().sum(1).max().log())
@@ -575,15 +578,16 @@ class LipschitzLinear(nn.Linear):
 
 
 def lipschitz_loss(network):
-    """L_lps: log of the network's bound, which is the product of its layers'. The product itself
-    would exceed L_rgb at first by far and stop the colours from being learnt. [D4]"""
+    """L_lps: log of the network's bound, which is the product of its layers'. The gradient of the
+    product itself changes by orders of magnitude with width and training. [D4]"""
     return sum(layer.c for layer in network[::2])
 
 
 # ---- 5 From SDF to colour: alpha, compositing, samples, background -------------------------------
 
 PROBES = 64  # even intervals of a ray at whose ends the cache is looked up, to place samples
-UNIFORM_SHARE = 0.25  # weight of evenly spread samples, so that a lost surface can return
+UNIFORM_SHARE = 0.25  # weight of evenly spread samples over that of others, so that a lost
+# surface can return
 
 
 def neus_alpha(sdf, zeta):
@@ -599,7 +603,8 @@ def neus_alpha(sdf, zeta):
 
 def composite(alpha):
     """Eq. 2: weights w_i = T_i alpha_i (R,S) with T_i = prod_{j<i} (1 - alpha_j). As a sum of logs,
-    in which the transmittance of an opaque interval counts as 1e-6."""
+    in which the transmittance of an opaque interval counts as 1e-6: the sum of w can exceed 1 by
+    as much."""
     log_pass = torch.log1p((1e-6 - 1) * alpha)  # (R,S) log transmittance of each interval
     trans = torch.exp(log_pass.cumsum(1) - log_pass)  # (R,S) T_i
     return trans * alpha
@@ -656,7 +661,7 @@ class SDFCache(nn.Module):
 
     def refresh_coarse(self, sdf):
         """Evaluates sdf on a grid of half as many points along an axis, s being linear between
-        them: enough for a soft surface, an eighth of the cost."""
+        them: enough for a soft surface, an eighth of the cost. Creases count less in Phi."""
         m = self.n // 2
         points = grid_index(m, self.volume.device) * (2 / (m - 1)) - 1
         s = in_chunks(sdf, points).view(1, 1, m, m, m)
@@ -772,6 +777,7 @@ def render_rays(model, rays, code, random, points):
         depth          (R,)      where the foreground is hit, on average
         surface_point  (R,3)     the point there
         place          (R,3)     where the ray ends, in contracted space: there or on the background
+                                 beyond the sphere
         normal         (R,3)     at the surface point, times opacity
         e_grad         (R+N,)    E_grad at surface points, then at points
         e_curv         (R,)      E_curv at surface points, times opacity
@@ -824,8 +830,8 @@ def render_rays(model, rays, code, random, points):
 
 # ---- 6 Photos in the wild: transient mask and geometry preservation ------------------------------
 
-LAMBDA_GRAD, LAMBDA_CURV = 10.0, 2.0  # of Eq. 4 (paper)
-MASK_TRAINING = 0.6  # share of training; then M is fixed, as errors of memorised people are small
+LAMBDA_GRAD, LAMBDA_CURV = 10.0, 2.0  # of Eq. 4 (paper); as a weight of L_curv 2 exceeds L_rgb
+MASK_TRAINING = 0.6  # share; then M is fixed, as errors of memorised people are small [D3]
 REJECTION = 0.3  # share of training in which outliers are rejected
 MIN_THRESHOLD = 0.15  # no smaller error makes a pixel transient
 PLACE_CELLS = 32  # along an axis, of the table of errors over contracted space
@@ -852,7 +858,7 @@ def edge_indicator(values, opacity, quantiles):
 
 def gpl_loss(mask, phi):
     """L_GPL, Eq. 3: the mean of M(r) Phi(r); the mask must not erase edges of the structure. Phi
-    has no gradient: the loss moves the mask, never the SDF."""
+    has no gradient: the loss moves the mask, never the SDF. [D8]"""
     return (mask * phi).mean()
 
 
@@ -860,8 +866,8 @@ def mask_loss(logit, excess):
     """L_reg: binary cross entropy that classifies rays (R,) by their error. A ray whose error
     exceeds its threshold (excess > 0) is trained towards M = 1, any other towards M = 0, weighted
     by |excess|. The same M minimises (1 - M) error + M threshold, but the gradient of that vanishes
-    where the sigmoid saturates. The paper's penalties for intensity and bimodality made M all 0 or
-    all 1. [D3]"""
+    where the sigmoid saturates. Penalties for intensity and bimodality, as in CR-NeRF, made M all 0
+    or all 1. [D3]"""
     is_transient = (excess > 0).float()
     return F.binary_cross_entropy_with_logits(logit, is_transient, excess.abs())
 
@@ -1106,7 +1112,7 @@ class GeoNVS(nn.Module):
             reg=reg,
             gpl=gpl,
             lps=lipschitz_loss(self.color),
-            sfm=pull * out["sdf"][:len(sfm)].abs().mean())  # instead of an off-surface penalty
+            sfm=pull * out["sdf"][:len(sfm)].abs().mean())  # [D7]
         total = objective(loss, cfg)
         log = loss | dict(
             mse=residual.square().mean(),
@@ -1125,9 +1131,8 @@ class GeoNVS(nn.Module):
         gpl = error.new_zeros(())
         left_out = torch.zeros_like(error)
         if self.cfg.mask != "off":
-            logit = sample_logits(self.mask.logits(photos), rays.uv)  # (R,)
-            if done >= MASK_TRAINING:
-                logit = logit.detach()
+            with torch.set_grad_enabled(done < MASK_TRAINING):
+                logit = sample_logits(self.mask.logits(photos), rays.uv)  # (R,)
             M = logit.sigmoid()
             # SfM pixels count as if they had no error: they train M = 0 [D7]
             excess = error * ~rays.is_static - self.mask.threshold(out["place"])
@@ -1156,7 +1161,7 @@ class GeoNVS(nn.Module):
         self.cache.refresh(self.distance)
 
     def update_statistics(self, rays, out):
-        """Remembers what refinement and the mask's threshold depend on."""
+        """Remembers what refinement, the mask's threshold and Phi depend on."""
         self.mask.update_quantiles(rays, out, out["error"])
         is_solid = out["is_solid"]  # (R,)
         pixel = out["depth"] / self.scene.K[rays.img, 0]  # (R,) its size at the surface point
@@ -1205,7 +1210,8 @@ class GeoNVS(nn.Module):
 
     @torch.no_grad()
     def decide_mask(self):
-        """--mask auto: off if M marks hardly anything in 64 training photos. [D10]"""
+        """--mask auto: off if M marks hardly anything in 64 training photos; pixels that a user's
+        mask excludes count, too. [D10]"""
         if self.cfg.mask == "auto":
             photos = self.scene.train[:64]
             share = self.mask.logits(photos).sigmoid().mean().item()
@@ -1226,7 +1232,7 @@ class GeoNVS(nn.Module):
 
 def open_counter(device):
     """A function that reads joules of a GPU, or of the GPUs of all processes, through NVML (Volta
-    and newer), whatever CUDA_VISIBLE_DEVICES says."""
+    and newer), whatever CUDA_VISIBLE_DEVICES says. All processes run on one machine."""
     check(device.type == "cuda", "only GPUs are metered")
     import pynvml
     pynvml.nvmlInit()
