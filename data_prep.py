@@ -231,6 +231,749 @@ def pixel_index(uv, wh):
     return np.clip(uv, 0, np.subtract(wh, 1)).astype(int) @ (1, wh[0])
 
 
+# ---- from photos, poses and points to a scene ------------------------------------------
+def find_sphere(x, weight, tracks, is_test, contain):
+    """Centre (3,) and radius of the scene sphere, which becomes the unit sphere [D7].
+
+    Centre: geometric median of points x (P,3) by weight. Radius: 1.1 x the distance of
+    95 %; if that is a skyline, more than four times the median distance away, only
+    nearer points are counted. Inside are at least 30 % of the points (M,) of most
+    training photos, and contain (...,3).
+    """
+    center = np.median(x, axis=0)
+    for _ in range(20):  # Weiszfeld
+        w = weight / np.maximum(lengths(x - center), EPSILON)
+        center = w @ x / w.sum()
+    distance = lengths(x - center)  # (P,)
+    counted = np.repeat(distance, weight)
+    limit = 4 * np.median(counted)
+    if np.quantile(counted, 0.95) > limit:
+        counted = counted[counted <= limit]
+    # A distance in `counted`: between two of them there may be a gap.
+    radius = 1.1 * np.quantile(counted, 0.95, method="inverted_cdf")
+    reach = [
+        np.quantile(distance[track], 0.3)
+        for track, held_out in zip(tracks, is_test)
+        if len(track) and not held_out
+    ]
+    check(reach,
+          "no training photo observes a usable 3D point: they do not belong together")
+    corners = 1.02 * lengths(np.reshape(contain, (-1, 3)) - center)  # a margin
+    radius = max(radius, np.median(reach), *corners)
+    check(radius > EPSILON, "all 3D points coincide: run SfM again")
+    return center, radius
+
+
+def build_scene(
+        images, K, c2w, is_test, name, points, tracks, info, contain=(), masks=None):
+    """The scene of images (h,w,3), each of which sees the points tracks (M,).
+
+    SfM units: c2w; points (P,5): x y z, error [px], track length; contain (...,3).
+    masks: of each photo (h,w) bool, True is left out.
+    """
+    error, track_length = points[:, 3:].T
+    usable = track_length >= 3
+    if usable.sum() < 500:
+        usable = track_length >= 2
+    check(usable.sum() >= 20,
+          f"{usable.sum()} usable 3D points: SfM needs more overlapping photos")
+    usable &= error <= np.quantile(error[usable], 0.95)
+    new_index = np.cumsum(usable) - 1
+    tracks = [new_index[track[usable[track]]] for track in tracks]  # drop unusable, renumber
+    x = points[usable, :3]
+    weight = np.minimum(track_length[usable], 20).astype(int)
+    center, radius = find_sphere(x, weight, tracks, is_test, contain)
+    c2w = np.array(c2w)
+    c2w[:, :, 3] = (c2w[:, :, 3] - center) / radius
+    wh = np.array([image.shape[1::-1] for image in images])
+    arrays = dict(
+        rgb=np.concatenate([image.reshape(-1, 3) for image in images]),
+        start=np.cumsum([0, *wh.prod(1)]),
+        wh=wh,
+        K=K,
+        c2w=c2w,
+        is_test=is_test,
+        name=name,
+        points=(x - center) / radius,
+        track_photo=np.repeat(np.arange(len(wh)), [len(track) for track in tracks]),
+        track_point=np.concatenate(tracks),
+        center=center,
+        scale=radius,
+        info=json.dumps(info))
+    scene = {}
+    for key, value in arrays.items():
+        dtype, _ = FORMAT[key]
+        scene[key] = np.asarray(value, dtype)
+    if masks:
+        scene["masked"] = np.concatenate([mask.ravel() for mask in masks])
+    return add_statistics(scene)
+
+
+def brightness_spread(points, brightness):
+    """Deviation of photos' brightness at equal points. Lists of (M,), an item a photo."""
+    all_points = np.concatenate(points)
+    mean = np.bincount(all_points, np.concatenate(brightness))
+    mean /= np.maximum(np.bincount(all_points), 1)  # (P,)
+    offsets = []
+    for track, b in zip(points, brightness):
+        if len(track):
+            offsets.append(np.median(b - mean[track]))
+    return np.std(offsets) if offsets else np.float64(0)
+
+
+def common_color(colors):
+    """Median of colours uint8 (P,3) in 0..1; NaN unless 60 % are like it. -> (3,)"""
+    if len(colors) > 100:  # fewer may all be people
+        median = np.median(colors, axis=0)
+        is_like = (abs(colors - median) < 5.1).all(1)
+        if is_like.mean() > 0.6:
+            return median / 255
+    return np.full(3, np.nan)
+
+
+def add_statistics(scene):
+    """Adds near, track_uv, footprint, exposure_spread, bg_color.
+
+    near: 0.8 x the 2 % quantile of the distances of a photo's points, >= 0.02.
+    """
+    near, track_uv = [], []
+    for i, (K, c2w, wh) in enumerate(zip(scene["K"], scene["c2w"], scene["wh"])):
+        track = scene["track_point"][scene["track_photo"] == i]
+        uv, distance = project(K, c2w, scene["points"][track])
+        track_uv.append(np.clip(uv / wh, -1, 2))
+        near.append(max(0.8 * np.quantile(distance, 0.02), 0.02) if len(track) else 0.05)
+    arrays = dict(
+        near=np.float32(near),
+        track_uv=np.concatenate(track_uv, dtype=np.float32))
+    return scene | arrays | training_statistics(scene)
+
+
+def training_statistics(scene):
+    """The numbers of FORMAT that come from the training photos, without masked pixels.
+
+    footprint: lower quartile of a pixel's size at points in the sphere.
+    exposure_spread: deviation of brightness at equal points.
+    bg_color: seen by rays that miss the sphere, NaN unless 60 % agree.
+    """
+    rgb = scene["rgb"]
+    masked = scene.get("masked", np.zeros(len(rgb), bool))
+    step = max(1, len(rgb) // 500_000)
+    observed, sizes, brightness, background = [], [], [], []
+    for i in np.flatnonzero(~scene["is_test"]):
+        first, K, c2w, wh = [scene[key][i] for key in ("start", "K", "c2w", "wh")]
+        track = scene["track_point"][scene["track_photo"] == i]
+        x = scene["points"][track]
+        uv, distance = project(K, c2w, x)
+        sizes.append(distance[lengths(x) < 1] / K[0])
+        pixel = first + pixel_index(uv, wh)
+        is_seen = ~masked[pixel]
+        observed.append(track[is_seen])
+        brightness.append(rgb[pixel[is_seen]].mean(1) / 255)
+        o = c2w[:, 3]
+        d = ray_directions(K, c2w, *wh)
+        closest = o - np.minimum(d @ o, 0)[:, None] * d  # to the centre, along each ray
+        is_miss = lengths(closest) > 1
+        is_miss &= ~masked[first:first + len(d)]
+        background.append(rgb[first + np.flatnonzero(is_miss)[::step]])
+    return dict(
+        footprint=np.quantile(np.concatenate(sizes), 0.25),
+        exposure_spread=brightness_spread(observed, brightness),
+        bg_color=common_color(np.concatenate(background)))
+
+
+# ---- COLMAP models ---------------------------------------------------------------------
+# COLMAP's camera models in the order of their numbers, with their parameters.
+CAMERA_MODELS = dict(
+    SIMPLE_PINHOLE="f cx cy",
+    PINHOLE="fx fy cx cy",
+    SIMPLE_RADIAL="f cx cy k1",
+    RADIAL="f cx cy k1 k2",
+    OPENCV="fx fy cx cy k1 k2 p1 p2",
+    OPENCV_FISHEYE="fx fy cx cy k1 k2 k3 k4",
+    FULL_OPENCV="fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6",
+    FOV="fx fy cx cy omega",
+    SIMPLE_RADIAL_FISHEYE="f cx cy k",
+    RADIAL_FISHEYE="f cx cy k1 k2",
+    THIN_PRISM_FISHEYE="fx fy cx cy k1 k2 p1 p2 k3 k4 sx1 sy1",
+    RAD_TAN_THIN_PRISM_FISHEYE="fx fy cx cy k0 k1 k2 k3 k4 k5 p0 p1 s0 s1 s2 s3",
+    SIMPLE_DIVISION="f cx cy k",
+    DIVISION="fx fy cx cy k",
+    SIMPLE_FISHEYE="f cx cy",
+    FISHEYE="fx fy cx cy",
+    EUCM="fx fy cx cy alpha beta",
+    EQUIRECTANGULAR="w h",
+)
+PERSPECTIVE = "SIMPLE_PINHOLE PINHOLE SIMPLE_RADIAL RADIAL OPENCV FULL_OPENCV".split()
+OPENCV_DISTORTION = "k1 k2 p1 p2 k3 k4 k5 k6".split()
+
+
+def open_binary(path):
+    """A function that reads the next values of a little-endian file, by struct's layouts."""
+    check(path.is_file(),
+          f"{path} is missing: copy the whole model, or for points run "
+          "colmap point_triangulator")
+    file = io.BytesIO(path.read_bytes())
+
+    def read(layout):
+        try:
+            record = struct.Struct("<" + layout)
+            return record.unpack(file.read(record.size))
+        except struct.error as e:  # too few bytes are left, or none could be enough
+            says = f"{path} ends too early: copy it again, or delete its folder"
+            raise UserError(says) from e
+    return read
+
+
+def read_cameras(sparse):
+    """{number: (wh, K (4,), OPENCV_DISTORTION (8,))} of a model's perspective cameras."""
+    cameras = {}
+    read = open_binary(sparse / "cameras.bin")
+    (count,) = read("Q")
+    for _ in range(count):
+        number, kind, *wh = read("IiQQ")
+        check(0 <= kind < len(CAMERA_MODELS),
+              f"{sparse} has camera model {kind}, which is unknown: run "
+              "colmap image_undistorter")
+        model, names = list(CAMERA_MODELS.items())[kind]
+        names = names.split()
+        value = dict(zip(names, read(f"{len(names)}d")))
+        if model in PERSPECTIVE:
+            f = value.get("f")
+            K = [value.get("fx", f), value.get("fy", f), value["cx"], value["cy"]]
+            distortion = [value.get(name, 0.0) for name in OPENCV_DISTORTION]
+            cameras[number] = wh, np.array(K), np.array(distortion)
+    return cameras
+
+
+def read_photos(sparse):
+    """{name: (camera or None, pose (7,), ids of its points)} of a COLMAP model."""
+    cameras = read_cameras(sparse)
+    photos = {}
+    read = open_binary(sparse / "images.bin")
+    (count,) = read("Q")
+    for _ in range(count):
+        _, *pose, camera = read("I7dI")
+        letters = iter(lambda: read("c")[0], b"\0")  # the name ends with a zero byte
+        name = b"".join(letters).decode(errors="surrogateescape")
+        name = name.replace("\\", "/")  # of Windows
+        (observations,) = read("Q")
+        # Records (u, v, point id), 8 bytes each; u and v are doubles and are skipped.
+        ids = read(f"{3 * observations}Q")[2::3]
+        is_outside = any(step in ("", "..") for step in name.split("/"))
+        check(name not in photos and not is_outside,
+              f"{sparse}: photo {name!r} occurs twice or lies outside the image folder: "
+              "rename it")
+        photos[name] = cameras.get(camera), np.array(pose), ids
+    return photos
+
+
+def check_photo(camera, pose, is_test):
+    """UserError, a sentence about the photo, unless it can be used."""
+    check(camera,
+          "has no camera in the model, or a fisheye: run colmap image_undistorter")
+    wh, K, distortion = camera
+    numbers = np.concatenate([K, distortion, pose])
+    is_sound = (abs(numbers) < MAX_NUMBER).all() and min(K[:2]) > EPSILON and pose[:4].any()
+    check(is_sound and max(wh) < 32767, "has no sound camera or pose: run SfM again")
+    angle = 2 * np.degrees(np.arctan(max(wh / K[:2]) / 2))
+    check(is_test or 10 <= angle <= 120,
+          f"is {angle:.1f} degrees wide, which is not in 10..120")
+
+
+def camera_to_world(pose):
+    """COLMAP's world to camera, quaternion and translation (7,) -> c2w (3,4)"""
+    w, *v = pose[:4] / np.linalg.norm(pose[:4])  # old files are not normalised
+    turn = np.cross(v, np.eye(3))
+    R = np.eye(3) + 2 * w * turn + 2 * turn @ turn
+    return np.column_stack([R, -R @ pose[4:]])
+
+
+def read_points(sparse):
+    """Points (P,5) of a COLMAP model, as in build_scene, and {id: row} of them."""
+    points, rows = [], {}
+    read = open_binary(sparse / "points3D.bin")
+    (count,) = read("Q")
+    for _ in range(count):
+        key, x, y, z, *_, error, track_length = read("Q3d3BdQ")
+        read(f"{2 * track_length}I")  # the track, skipped: photos list their points
+        rows[key] = len(points)
+        points.append((x, y, z, error, track_length))
+    points = np.array(points, float).reshape(-1, 5)
+    # Zero track length: build_scene drops them. nan compares as False.
+    points[~(abs(points) < MAX_NUMBER).all(1)] = 0
+    check((points[:, 4] > 1).any(),
+          f"no point of {sparse} has a track: run colmap point_triangulator on it")
+    return points, rows
+
+
+# ---- names and folders -----------------------------------------------------------------
+PHOTO_TYPES = (
+    ".jpg .jpeg .png .tif .tiff .bmp .webp .ppm .pgm .jp2 .avif .heic .heif".split())
+
+
+def files_below(folder, levels=7):
+    """Files at most so many levels down, without hidden folders and thumbnails.
+
+    Links are followed, unlike by rglob; broken ones are files.
+    """
+    files = []
+    if levels and folder.is_dir():
+        for path in sorted(folder.iterdir()):
+            if path.name.startswith((".", "@")):  # NAS boxes write @eaDir
+                continue
+            if path.is_dir():
+                files += files_below(path, levels - 1)
+            else:
+                files.append(path)
+    return files
+
+
+def photo_files(folder):
+    """{name: path} of the photos below a folder, without masks/ and copies in dense/."""
+    files = {}
+    for path in files_below(folder):
+        name = path.relative_to(folder)
+        is_photo = path.suffix.lower() in PHOTO_TYPES
+        if is_photo and name.parts[0] not in ("dense", "masks"):
+            files[name.as_posix()] = path
+    return files
+
+
+def mask_files(images, names):
+    """{photo: path of its mask}; masks/ lies beside the folder of photos or in it."""
+    folder = images / "masks"
+    if not folder.is_dir():
+        folder = images.parent / "masks"
+    files = {path.relative_to(folder).as_posix(): path for path in files_below(folder)}
+    masks = {}
+    for name in names:
+        other = str(PurePosixPath(name).with_suffix(".png"))
+        for candidate in (other, name + ".png", name):
+            if candidate in files:
+                masks[name] = files[candidate]
+                break
+    if files and not masks:
+        warn(f"{folder} is not used: no name in it, such as {min(files)}, is a photo's")
+    return masks
+
+
+def plain_name(name):
+    """A form that names share if they differ in case or Unicode form only."""
+    folded = unicodedata.normalize("NFC", name).casefold()
+    return unicodedata.normalize("NFC", folded)
+
+
+def match_names(wanted, there):
+    """{wanted name: its name there}: equal, or of equal plain_name if only one has it."""
+    found = {name: name for name in wanted if name in there}
+    ours, theirs = defaultdict(list), defaultdict(list)  # plain name: names
+    for name in set(wanted) - found.keys():
+        ours[plain_name(name)].append(name)
+    for name in set(there) - found.keys():
+        theirs[plain_name(name)].append(name)
+    for plain in ours.keys() & theirs.keys():
+        if len(ours[plain]) == 1 and len(theirs[plain]) == 1:
+            found[ours[plain][0]] = theirs[plain][0]
+    return found
+
+
+def name_hint(name, names):
+    """A hint at the name that may be meant, or nothing."""
+    stem = PurePosixPath(name).stem
+    close = [other for other in names if PurePosixPath(other).stem == stem]
+    close += difflib.get_close_matches(name, names, 1)
+    return f"; there is {close[0]!r}" if close else ""
+
+
+def open_model(folder, sparse):
+    """Reads a COLMAP model and finds the folder that holds most of its photos."""
+    photos = read_photos(sparse)
+    places = []
+    for place in (sparse, *sparse.parents):
+        places += [place / "images", place / "input", place]
+        if place == folder:
+            break
+    on_disk = [photo_files(place) for place in places]
+    matches = [match_names(photos, files) for files in on_disk]
+    best = max(range(len(places)), key=lambda i: len(matches[i]))
+    files = {name: on_disk[best][other] for name, other in matches[best].items()}
+    usable = [name for name in files if photos[name][0] is not None]  # with a camera
+    return SimpleNamespace(
+        sparse=sparse,
+        photos=photos,
+        images=places[best],
+        on_disk=list(on_disk[best]),
+        files=files,  # of the photos that are posed, and on disk
+        count=len(usable))
+
+
+def model_folders(folder):
+    return [path.parent for path in files_below(folder) if path.name == "images.bin"]
+
+
+def find_model(folder, command):
+    """The model in the folder with most photos; prints which photos and models it lacks.
+
+    command: how a model is made, for messages
+    """
+    models = [open_model(folder, sparse) for sparse in model_folders(folder)]
+    if not models and folder.name in ("images", "input"):
+        parent = Path(os.path.abspath(folder)).parent
+        check(not model_folders(parent),
+              f"{folder} has no COLMAP model, the folder around it has: give {parent}")
+    check(models,
+          f"{folder} has no binary COLMAP model: run {command}, or for a text model "
+          "colmap model_converter --output_type BIN")
+    best = max(models, key=lambda model: model.count)
+    check(best.photos,
+          f"{best.sparse} is an empty model, no photo is posed: delete it and run {command}")
+    lost = sorted(best.photos.keys() - best.files)
+    if lost:
+        hint = name_hint(lost[0], best.on_disk)
+        says = f"{len(lost)} photos of {best.sparse} are not on disk, such as {lost[0]!r}{hint}"
+        check(best.files, f"{says}: put them into {folder / 'images'}, or run {command}")
+        warn(says)
+    on_disk = max(len(model.on_disk) for model in models)
+    print(f"{best.images}: {on_disk} photos on disk, {len(best.files)} posed by {best.sparse}")
+    for model in models:
+        if model.photos.keys() != best.photos.keys():
+            print(f"left out is another model: {len(model.photos)} posed by {model.sparse}")
+    return best
+
+
+# ---- train/test split ------------------------------------------------------------------
+def read_table(path):
+    """Lines of a table of any separator, as lists of words."""
+    check(path.is_file(), f"the split file {path} is missing")
+    text = path.read_text("utf-8-sig", "surrogateescape")
+    lines = [line for line in text.splitlines() if line.strip()] or [""]
+    separator = max("\t;,", key=lines[0].count)
+    return [[word.strip(' "') for word in line.split(separator)] for line in lines]
+
+
+def split_files(folder, split):
+    """The table of the split, or train_list.txt and test_list.txt: named or in the folder."""
+    tables = [
+        path for path in sorted(folder.glob("[!.]*.[ct]sv"))
+        if "split" in read_table(path)[0]
+    ]
+    if not tables:
+        tables = list(folder.glob("train*.txt"))
+    if split:
+        tables = [Path(split)]
+    check(len(tables) < 2,
+          f"choose a split file by --split: {', '.join(map(str, tables))}")
+    if tables and tables[0].suffix == ".txt":
+        name = tables[0].name
+        tables = [
+            tables[0].with_name(re.sub("train|test", subset, name))
+            for subset in ("train", "test")
+        ]
+    return tables
+
+
+def read_split(tables):
+    """{name: whether it is held out} of what split_files finds.
+
+    A table has NeRF-W's columns; rows with an empty id do not count.
+    """
+    path = tables[0]
+    if len(tables) == 2:
+        rows = [
+            dict(filename=words[0], split=subset)
+            for subset, names in zip(("train", "test"), tables)
+            for words in read_table(names)
+        ]
+    else:
+        head, *lines = read_table(path)
+        check("filename" in head and "split" in head,
+              f"{path} needs a header with filename and split")
+        rows = [dict(zip(head, words)) for words in lines]
+    held_out = {}
+    for row in rows:
+        if row.get("id") == "":
+            continue
+        name = row.get("filename")
+        subset = row.get("split")
+        is_test = subset == "test"
+        check(name and subset in ("train", "test") and held_out.get(name, is_test) == is_test,
+              f"{path}: {name!r} is {subset!r}; each is train or test, and not both")
+        held_out[name] = is_test
+    return held_out
+
+
+def choose_held_out(folder, names, tables):
+    """{name: whether it is held out} of the photos that are to be used; tells the rule."""
+    if not tables:
+        print(f"{folder} has no split file: every eighth photo is held out")
+        return {name: i % 8 == 7 for i, name in enumerate(names)}
+    print(f"split by {tables[0]}")
+    held_out = read_split(tables)
+    matches = match_names(held_out, names)
+    held_out = {matches.get(name, name): is_test for name, is_test in held_out.items()}
+    rest = set(names) - held_out.keys()
+    if rest:
+        warn(f"{len(rest)} photos are not in {tables[0]}: {min(rest)} ...")
+    return held_out
+
+
+# ---- checksums -------------------------------------------------------------------------
+def checksum(paths, start=0):
+    """CRC-32 over the content of the files that exist."""
+    for path in paths:
+        if path.is_file():
+            start = zlib.crc32(path.read_bytes(), start)
+    return start
+
+
+def photos_checksum(files, masks, start=0):
+    """CRC-32 over the photos' names and content and their masks. files, masks: {name: path}"""
+    for name in sorted(files):
+        start = zlib.crc32(os.fsencode(name), start)
+        paths = [files[name]]
+        if name in masks:
+            paths.append(masks[name])
+        start = checksum(paths, start)
+    return start
+
+
+def fingerprint(info):
+    """CRC-32 over the content of all files that a scene is read from, wherever they lie."""
+    folder = Path(info["folder"])
+    images = Path(info["images"])
+    models = [
+        sparse / name
+        for sparse in model_folders(folder)
+        for name in ("cameras.bin", "images.bin", "points3D.bin")
+    ]
+    there = photo_files(images)
+    files = {
+        name: there[other] for name, other in match_names(info["posed"], there).items()}
+    masks = mask_files(images, files)
+    start = checksum([*models, *split_files(folder, info["split"])])
+    return photos_checksum(files, masks, start)
+
+
+def is_fresh(info):
+    """Whether a scene's sources are unchanged, or gone: a scene file needs none of them."""
+    if not Path(info["folder"]).is_dir():
+        return True
+    return "posed" in info and info["files"] == fingerprint(info)
+
+
+# ---- photos and masks ------------------------------------------------------------------
+def is_heic(path):
+    """Whether a file is HEIC, by its content; phones often name it .jpg."""
+    with open(path, "rb") as file:
+        head = file.read(12)
+    return head[4:8] == b"ftyp" and head[8:] in (b"heic", b"heix", b"mif1", b"msf1")
+
+
+def is_cut_off(data):
+    """Whether a JPEG or PNG file lacks its end, which OpenCV does not report."""
+    if data[1:4] == b"PNG":
+        return b"IEND" not in data
+    last_scan = data.rfind(b"\xff\xda")
+    end_mark = data.rfind(b"\xff\xd9")
+    return data[:2] == b"\xff\xd8" and end_mark < last_scan
+
+
+def decode(data, flags):
+    """The decoded image, or None."""
+    try:
+        return cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    except cv2.error:  # empty, or more than a gigapixel
+        return None
+
+
+def undistort(image, camera):
+    """An image (h,w) or (h,w,3) as a pinhole camera sees it, and its K (4,)."""
+    wh, K, distortion = camera
+    if not distortion.any():
+        return image, K
+    fx, fy, cx, cy = K - (0, 0, 0.5, 0.5)  # OpenCV's first pixel is at 0
+    M = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    P, _ = cv2.getOptimalNewCameraMatrix(M, distortion, wh, 0)  # 0: nothing but photo
+    image = cv2.undistort(image, M, distortion, None, P)
+    return image, np.array([P[0, 0], P[1, 1], P[0, 2] + 0.5, P[1, 2] + 0.5])
+
+
+def read_photo(path, camera, downscale):
+    """Reads, undistorts and downscales a photo. -> rgb uint8 (h,w,3), K (4,)"""
+    w, h = camera[0]
+    check(1 <= downscale <= min(w, h) / 2, f"is {w} x {h}: choose another --downscale")
+    check(path.is_file(), "is a broken link: copy the photo itself")
+    check(not is_heic(path), "is HEIC, which cannot be read: convert it to JPEG")
+    data = path.read_bytes()
+    check(not is_cut_off(data), "is cut off: copy it again")
+    image = decode(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    check(image is not None,
+          "is empty, damaged, too large or no photo of a known type: replace it")
+    stored = image.shape[1::-1]
+    if stored != (w, h):
+        image = decode(data, cv2.IMREAD_COLOR)
+    size = image.shape[1::-1]
+    tag = "" if size == stored else f", {size[0]} x {size[1]} by its EXIF orientation tag"
+    check(size == (w, h),
+          f"has {stored[0]} x {stored[1]} pixels{tag}, its camera {w} x {h}: put back what "
+          "SfM saw")
+    image, K = undistort(image, camera)
+    small = w // downscale, h // downscale
+    image = cv2.resize(image, small, interpolation=cv2.INTER_AREA)
+    return image[..., ::-1], K * (small * 2) / (w, h, w, h)
+
+
+def read_mask(path, size):
+    """Reads a mask and scales it to its photo's size (w, h).
+
+    -> uint8 (h,w): 0 is left out, 255 is not
+    """
+    mask = decode(path.read_bytes(), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+    check(mask is not None, "is no image")
+    mask = np.where(mask < 128, 0, 255).astype(np.uint8)
+    h, w = mask.shape
+    check(abs(w * size[1] / (h * size[0]) - 1) < 0.02,
+          f"has {w} x {h} pixels, its photo {size[0]} x {size[1]}")
+    check(mask.any(), "is black all over; 255 is white")
+    return cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST)
+
+
+def read_masks(model, usable):
+    """The pixels that are left out of each usable photo: a list of (h,w) bool, or None."""
+    paths = mask_files(model.images, usable)
+    masks = []
+    used = 0
+    for name, (image, *_) in usable.items():
+        h, w = image.shape[:2]
+        masked = np.zeros((h, w), bool)
+        if name in paths:
+            camera = model.photos[name][0]
+            try:
+                mask, _ = undistort(read_mask(paths[name], camera[0]), camera)
+                mask = cv2.resize(mask, (w, h), interpolation=cv2.INTER_AREA)
+                masked = mask < 128
+                used += 1
+            except UserError as e:
+                warn(f"mask not used: {paths[name]} {e}")
+        masks.append(masked)
+    if not used:
+        return None
+    black = np.mean(np.concatenate([masked.ravel() for masked in masks]))
+    print(f"{used} of {len(masks)} photos have a mask: {black:.0%} of all pixels are black "
+          "and left out")
+    return masks
+
+
+# ---- prepare ---------------------------------------------------------------------------
+def read_usable(model, points, rows, held_out, downscale):
+    """{name: (rgb, K, c2w, rows of its points)} of the photos that can be used.
+
+    Tells which cannot, and why.
+    """
+    usable = {}
+    misfits = {}  # photos that miss most of the points that they should see
+    for name in progress(sorted(held_out), "preparing photos"):
+        try:
+            check(name in model.photos, f"has no pose{name_hint(name, model.files)}")
+            check(name in model.files, f"is not on disk{name_hint(name, model.on_disk)}")
+            camera, pose, ids = model.photos[name]
+            check_photo(camera, pose, held_out[name])
+            image, K = read_photo(model.files[name], camera, downscale)
+        except UserError as e:
+            warn(f"left out: {name} {e}")
+            continue
+        c2w = camera_to_world(pose)
+        track = np.array([rows[key] for key in ids if key in rows], int)
+        uv, _ = project(K, c2w, points[track, :3])
+        is_inside = is_in_photo(uv, image.shape[1::-1])
+        if len(track) and is_inside.mean() < 0.5:
+            misfits[name] = is_inside.mean()
+        usable[name] = image, K, c2w, track
+    check(2 * len(misfits) <= len(usable),
+          f"{len(misfits)} of {len(usable)} photos miss most of their points: give poses as "
+          "COLMAP does, world to camera, x right, y down, z forward, in the units of the points")
+    for name, share in misfits.items():
+        warn(f"left out: {name} shows {share:.0%} of its points: its pose or its distortion "
+             "is wrong")
+        del usable[name]
+    lost = [name for name in held_out if held_out[name] and name not in usable]
+    check(not lost,
+          f"held-out photos cannot be used, repair them or hold out others: {lost}")
+    count = sum(not held_out[name] for name in usable)
+    check(count >= 2,
+          f"{count} usable training photos are too few: repair them or the split file")
+    return usable
+
+
+def prepare(name, downscale=2, split=None):
+    """Scene of one of SCENES, or of a folder with photos and a COLMAP model; see FORMAT."""
+    folder = Path(name)
+    command = f"python data_prep.py {name} --sfm"
+    if name in SCENES:
+        folder = DATA / name
+        command = f"python data_prep.py {name} --download"
+        if not folder.is_dir():
+            folder = DATA / SCENES[name][0]
+    model = find_model(folder, command)
+    split = os.path.abspath(split) if split else None
+    info = dict(
+        scene=folder.resolve().name,
+        kind="colmap",
+        downscale=downscale,
+        folder=str(folder),
+        images=str(model.images),
+        posed=sorted(model.photos),
+        split=split)
+    info["files"] = fingerprint(info)
+    tables = split_files(folder, split)
+    held_out = choose_held_out(folder, sorted(model.files), tables)
+    points, rows = read_points(model.sparse)
+    usable = read_usable(model, points, rows, held_out, downscale)
+    masks = read_masks(model, usable)
+    images, K, c2w, tracks = zip(*usable.values())
+    is_test = [held_out[name] for name in usable]
+    scene = build_scene(
+        images, K, c2w, is_test, list(usable), points, tracks, info, masks=masks)
+    spread = [
+        np.std(scene["track_uv"][scene["track_photo"] == i], axis=0).max()
+        for i in np.unique(scene["track_photo"])
+    ]
+    check(np.median(spread) > 0.02,
+          "the points of a photo lie on one spot of it: give poses in the units of the points")
+    inside = (lengths(scene["points"]) < 1).mean()
+    print(f"the sphere has a radius of {scene['scale']:.3g} units of the reconstruction; "
+          f"{inside:.0%} of the points are inside")
+    return scene
+
+
+def scene_path(name_or_folder):
+    """data/<scene>.npz; of two folders with one name each has its own."""
+    folder = Path(name_or_folder).resolve()
+    mark = ""
+    if name_or_folder not in ("toy", *SCENES):
+        mark = f"-{zlib.crc32(os.fsencode(folder)):08x}"
+    return DATA / f"{folder.name}{mark}.npz"
+
+
+def open_scene(name_or_folder, downscale=2):
+    """Scene from its file: made on first use, and anew if the content of a source differs."""
+    path = scene_path(name_or_folder)
+    split = None
+    if path.exists():
+        scene = read_scene(path)
+        info = json.loads(str(scene["info"]))
+        split = info["split"]  # named once, by --split
+        if info["kind"] == "toy" or (info["downscale"] == downscale and is_fresh(info)):
+            return scene
+    print(f"making {path}")
+    if name_or_folder == "toy":
+        scene = make_toy()
+    else:
+        scene = prepare(name_or_folder, downscale, split)
+    write_scene(path, scene)
+    return scene
+
+
 # ---- the toy: z up, front towards -y, in its own units ---------------------------------
 # Arbitrary: centre and scale of the scene must be recovered.
 TOY_SCALE = 3.7
@@ -741,742 +1484,6 @@ def surface_truth(scene, surface, background, landmark):
         wall_normal=normal[is_smooth],
         near_wall=near[is_near],
         near_wall_sdf=distance[is_near])
-
-
-# ---- from photos, poses and points to a scene ------------------------------------------
-def find_sphere(x, weight, tracks, is_test, contain):
-    """Centre (3,) and radius of the scene sphere, which becomes the unit sphere [D7].
-
-    Centre: geometric median of points x (P,3) by weight. Radius: 1.1 x the distance of
-    95 %; if that is a skyline, more than four times the median distance away, only
-    nearer points are counted. Inside are at least 30 % of the points (M,) of most
-    training photos, and contain (...,3).
-    """
-    center = np.median(x, axis=0)
-    for _ in range(20):  # Weiszfeld
-        w = weight / np.maximum(lengths(x - center), EPSILON)
-        center = w @ x / w.sum()
-    distance = lengths(x - center)  # (P,)
-    counted = np.repeat(distance, weight)
-    limit = 4 * np.median(counted)
-    if np.quantile(counted, 0.95) > limit:
-        counted = counted[counted <= limit]
-    # A distance in `counted`: between two of them there may be a gap.
-    radius = 1.1 * np.quantile(counted, 0.95, method="inverted_cdf")
-    reach = [
-        np.quantile(distance[track], 0.3)
-        for track, held_out in zip(tracks, is_test)
-        if len(track) and not held_out
-    ]
-    check(reach,
-          "no training photo observes a usable 3D point: they do not belong together")
-    corners = 1.02 * lengths(np.reshape(contain, (-1, 3)) - center)  # a margin
-    radius = max(radius, np.median(reach), *corners)
-    check(radius > EPSILON, "all 3D points coincide: run SfM again")
-    return center, radius
-
-
-def build_scene(
-        images, K, c2w, is_test, name, points, tracks, info, contain=(), masks=None):
-    """The scene of images (h,w,3), each of which sees the points tracks (M,).
-
-    SfM units: c2w; points (P,5): x y z, error [px], track length; contain (...,3).
-    masks: of each photo (h,w) bool, True is left out.
-    """
-    error, track_length = points[:, 3:].T
-    usable = track_length >= 3
-    if usable.sum() < 500:
-        usable = track_length >= 2
-    check(usable.sum() >= 20,
-          f"{usable.sum()} usable 3D points: SfM needs more overlapping photos")
-    usable &= error <= np.quantile(error[usable], 0.95)
-    new_index = np.cumsum(usable) - 1
-    tracks = [new_index[track[usable[track]]] for track in tracks]  # drop unusable, renumber
-    x = points[usable, :3]
-    weight = np.minimum(track_length[usable], 20).astype(int)
-    center, radius = find_sphere(x, weight, tracks, is_test, contain)
-    c2w = np.array(c2w)
-    c2w[:, :, 3] = (c2w[:, :, 3] - center) / radius
-    wh = np.array([image.shape[1::-1] for image in images])
-    arrays = dict(
-        rgb=np.concatenate([image.reshape(-1, 3) for image in images]),
-        start=np.cumsum([0, *wh.prod(1)]),
-        wh=wh,
-        K=K,
-        c2w=c2w,
-        is_test=is_test,
-        name=name,
-        points=(x - center) / radius,
-        track_photo=np.repeat(np.arange(len(wh)), [len(track) for track in tracks]),
-        track_point=np.concatenate(tracks),
-        center=center,
-        scale=radius,
-        info=json.dumps(info))
-    scene = {}
-    for key, value in arrays.items():
-        dtype, _ = FORMAT[key]
-        scene[key] = np.asarray(value, dtype)
-    if masks:
-        scene["masked"] = np.concatenate([mask.ravel() for mask in masks])
-    return add_statistics(scene)
-
-
-def brightness_spread(points, brightness):
-    """Deviation of photos' brightness at equal points. Lists of (M,), an item a photo."""
-    all_points = np.concatenate(points)
-    mean = np.bincount(all_points, np.concatenate(brightness))
-    mean /= np.maximum(np.bincount(all_points), 1)  # (P,)
-    offsets = []
-    for track, b in zip(points, brightness):
-        if len(track):
-            offsets.append(np.median(b - mean[track]))
-    return np.std(offsets) if offsets else np.float64(0)
-
-
-def common_color(colors):
-    """Median of colours uint8 (P,3) in 0..1; NaN unless 60 % are like it. -> (3,)"""
-    if len(colors) > 100:  # fewer may all be people
-        median = np.median(colors, axis=0)
-        is_like = (abs(colors - median) < 5.1).all(1)
-        if is_like.mean() > 0.6:
-            return median / 255
-    return np.full(3, np.nan)
-
-
-def add_statistics(scene):
-    """Adds near, track_uv, footprint, exposure_spread, bg_color.
-
-    near: 0.8 x the 2 % quantile of the distances of a photo's points, >= 0.02.
-    """
-    near, track_uv = [], []
-    for i, (K, c2w, wh) in enumerate(zip(scene["K"], scene["c2w"], scene["wh"])):
-        track = scene["track_point"][scene["track_photo"] == i]
-        uv, distance = project(K, c2w, scene["points"][track])
-        track_uv.append(np.clip(uv / wh, -1, 2))
-        near.append(max(0.8 * np.quantile(distance, 0.02), 0.02) if len(track) else 0.05)
-    arrays = dict(
-        near=np.float32(near),
-        track_uv=np.concatenate(track_uv, dtype=np.float32))
-    return scene | arrays | training_statistics(scene)
-
-
-def training_statistics(scene):
-    """The numbers of FORMAT that come from the training photos, without masked pixels.
-
-    footprint: lower quartile of a pixel's size at points in the sphere.
-    exposure_spread: deviation of brightness at equal points.
-    bg_color: seen by rays that miss the sphere, NaN unless 60 % agree.
-    """
-    rgb = scene["rgb"]
-    masked = scene.get("masked", np.zeros(len(rgb), bool))
-    step = max(1, len(rgb) // 500_000)
-    observed, sizes, brightness, background = [], [], [], []
-    for i in np.flatnonzero(~scene["is_test"]):
-        first, K, c2w, wh = [scene[key][i] for key in ("start", "K", "c2w", "wh")]
-        track = scene["track_point"][scene["track_photo"] == i]
-        x = scene["points"][track]
-        uv, distance = project(K, c2w, x)
-        sizes.append(distance[lengths(x) < 1] / K[0])
-        pixel = first + pixel_index(uv, wh)
-        is_seen = ~masked[pixel]
-        observed.append(track[is_seen])
-        brightness.append(rgb[pixel[is_seen]].mean(1) / 255)
-        o = c2w[:, 3]
-        d = ray_directions(K, c2w, *wh)
-        closest = o - np.minimum(d @ o, 0)[:, None] * d  # to the centre, along each ray
-        is_miss = lengths(closest) > 1
-        is_miss &= ~masked[first:first + len(d)]
-        background.append(rgb[first + np.flatnonzero(is_miss)[::step]])
-    return dict(
-        footprint=np.quantile(np.concatenate(sizes), 0.25),
-        exposure_spread=brightness_spread(observed, brightness),
-        bg_color=common_color(np.concatenate(background)))
-
-
-# ---- folders with photos, masks and COLMAP models --------------------------------------
-PHOTO_TYPES = (
-    ".jpg .jpeg .png .tif .tiff .bmp .webp .ppm .pgm .jp2 .avif .heic .heif".split())
-# COLMAP's camera models in the order of their numbers, with their parameters.
-CAMERA_MODELS = dict(
-    SIMPLE_PINHOLE="f cx cy",
-    PINHOLE="fx fy cx cy",
-    SIMPLE_RADIAL="f cx cy k1",
-    RADIAL="f cx cy k1 k2",
-    OPENCV="fx fy cx cy k1 k2 p1 p2",
-    OPENCV_FISHEYE="fx fy cx cy k1 k2 k3 k4",
-    FULL_OPENCV="fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6",
-    FOV="fx fy cx cy omega",
-    SIMPLE_RADIAL_FISHEYE="f cx cy k",
-    RADIAL_FISHEYE="f cx cy k1 k2",
-    THIN_PRISM_FISHEYE="fx fy cx cy k1 k2 p1 p2 k3 k4 sx1 sy1",
-    RAD_TAN_THIN_PRISM_FISHEYE="fx fy cx cy k0 k1 k2 k3 k4 k5 p0 p1 s0 s1 s2 s3",
-    SIMPLE_DIVISION="f cx cy k",
-    DIVISION="fx fy cx cy k",
-    SIMPLE_FISHEYE="f cx cy",
-    FISHEYE="fx fy cx cy",
-    EUCM="fx fy cx cy alpha beta",
-    EQUIRECTANGULAR="w h",
-)
-PERSPECTIVE = "SIMPLE_PINHOLE PINHOLE SIMPLE_RADIAL RADIAL OPENCV FULL_OPENCV".split()
-OPENCV_DISTORTION = "k1 k2 p1 p2 k3 k4 k5 k6".split()
-
-
-def open_binary(path):
-    """A function that reads the next values of a little-endian file, by struct's layouts."""
-    check(path.is_file(),
-          f"{path} is missing: copy the whole model, or for points run "
-          "colmap point_triangulator")
-    file = io.BytesIO(path.read_bytes())
-
-    def read(layout):
-        try:
-            record = struct.Struct("<" + layout)
-            return record.unpack(file.read(record.size))
-        except struct.error as e:  # too few bytes are left, or none could be enough
-            says = f"{path} ends too early: copy it again, or delete its folder"
-            raise UserError(says) from e
-    return read
-
-
-def read_cameras(sparse):
-    """{number: (wh, K (4,), OPENCV_DISTORTION (8,))} of a model's perspective cameras."""
-    cameras = {}
-    read = open_binary(sparse / "cameras.bin")
-    (count,) = read("Q")
-    for _ in range(count):
-        number, kind, *wh = read("IiQQ")
-        check(0 <= kind < len(CAMERA_MODELS),
-              f"{sparse} has camera model {kind}, which is unknown: run "
-              "colmap image_undistorter")
-        model, names = list(CAMERA_MODELS.items())[kind]
-        names = names.split()
-        value = dict(zip(names, read(f"{len(names)}d")))
-        if model in PERSPECTIVE:
-            f = value.get("f")
-            K = [value.get("fx", f), value.get("fy", f), value["cx"], value["cy"]]
-            distortion = [value.get(name, 0.0) for name in OPENCV_DISTORTION]
-            cameras[number] = wh, np.array(K), np.array(distortion)
-    return cameras
-
-
-def read_photos(sparse):
-    """{name: (camera or None, pose (7,), ids of its points)} of a COLMAP model."""
-    cameras = read_cameras(sparse)
-    photos = {}
-    read = open_binary(sparse / "images.bin")
-    (count,) = read("Q")
-    for _ in range(count):
-        _, *pose, camera = read("I7dI")
-        letters = iter(lambda: read("c")[0], b"\0")  # the name ends with a zero byte
-        name = b"".join(letters).decode(errors="surrogateescape")
-        name = name.replace("\\", "/")  # of Windows
-        (observations,) = read("Q")
-        # Records (u, v, point id), 8 bytes each; u and v are doubles and are skipped.
-        ids = read(f"{3 * observations}Q")[2::3]
-        is_outside = any(step in ("", "..") for step in name.split("/"))
-        check(name not in photos and not is_outside,
-              f"{sparse}: photo {name!r} occurs twice or lies outside the image folder: "
-              "rename it")
-        photos[name] = cameras.get(camera), np.array(pose), ids
-    return photos
-
-
-def check_photo(camera, pose, is_test):
-    """UserError, a sentence about the photo, unless it can be used."""
-    check(camera,
-          "has no camera in the model, or a fisheye: run colmap image_undistorter")
-    wh, K, distortion = camera
-    numbers = np.concatenate([K, distortion, pose])
-    is_sound = (abs(numbers) < MAX_NUMBER).all() and min(K[:2]) > EPSILON and pose[:4].any()
-    check(is_sound and max(wh) < 32767, "has no sound camera or pose: run SfM again")
-    angle = 2 * np.degrees(np.arctan(max(wh / K[:2]) / 2))
-    check(is_test or 10 <= angle <= 120,
-          f"is {angle:.1f} degrees wide, which is not in 10..120")
-
-
-def camera_to_world(pose):
-    """COLMAP's world to camera, quaternion and translation (7,) -> c2w (3,4)"""
-    w, *v = pose[:4] / np.linalg.norm(pose[:4])  # old files are not normalised
-    turn = np.cross(v, np.eye(3))
-    R = np.eye(3) + 2 * w * turn + 2 * turn @ turn
-    return np.column_stack([R, -R @ pose[4:]])
-
-
-def read_points(sparse):
-    """Points (P,5) of a COLMAP model, as in build_scene, and {id: row} of them."""
-    points, rows = [], {}
-    read = open_binary(sparse / "points3D.bin")
-    (count,) = read("Q")
-    for _ in range(count):
-        key, x, y, z, *_, error, track_length = read("Q3d3BdQ")
-        read(f"{2 * track_length}I")  # the track, skipped: photos list their points
-        rows[key] = len(points)
-        points.append((x, y, z, error, track_length))
-    points = np.array(points, float).reshape(-1, 5)
-    # Zero track length: build_scene drops them. nan compares as False.
-    points[~(abs(points) < MAX_NUMBER).all(1)] = 0
-    check((points[:, 4] > 1).any(),
-          f"no point of {sparse} has a track: run colmap point_triangulator on it")
-    return points, rows
-
-
-def files_below(folder, levels=7):
-    """Files at most so many levels down, without hidden folders and thumbnails.
-
-    Links are followed, unlike by rglob; broken ones are files.
-    """
-    files = []
-    if levels and folder.is_dir():
-        for path in sorted(folder.iterdir()):
-            if path.name.startswith((".", "@")):  # NAS boxes write @eaDir
-                continue
-            if path.is_dir():
-                files += files_below(path, levels - 1)
-            else:
-                files.append(path)
-    return files
-
-
-def photo_files(folder):
-    """{name: path} of the photos below a folder, without masks/ and copies in dense/."""
-    files = {}
-    for path in files_below(folder):
-        name = path.relative_to(folder)
-        is_photo = path.suffix.lower() in PHOTO_TYPES
-        if is_photo and name.parts[0] not in ("dense", "masks"):
-            files[name.as_posix()] = path
-    return files
-
-
-def mask_files(images, names):
-    """{photo: path of its mask}; masks/ lies beside the folder of photos or in it."""
-    folder = images / "masks"
-    if not folder.is_dir():
-        folder = images.parent / "masks"
-    files = {path.relative_to(folder).as_posix(): path for path in files_below(folder)}
-    masks = {}
-    for name in names:
-        other = str(PurePosixPath(name).with_suffix(".png"))
-        for candidate in (other, name + ".png", name):
-            if candidate in files:
-                masks[name] = files[candidate]
-                break
-    if files and not masks:
-        warn(f"{folder} is not used: no name in it, such as {min(files)}, is a photo's")
-    return masks
-
-
-def plain_name(name):
-    """A form that names share if they differ in case or Unicode form only."""
-    folded = unicodedata.normalize("NFC", name).casefold()
-    return unicodedata.normalize("NFC", folded)
-
-
-def match_names(wanted, there):
-    """{wanted name: its name there}: equal, or of equal plain_name if only one has it."""
-    found = {name: name for name in wanted if name in there}
-    ours, theirs = defaultdict(list), defaultdict(list)  # plain name: names
-    for name in set(wanted) - found.keys():
-        ours[plain_name(name)].append(name)
-    for name in set(there) - found.keys():
-        theirs[plain_name(name)].append(name)
-    for plain in ours.keys() & theirs.keys():
-        if len(ours[plain]) == 1 and len(theirs[plain]) == 1:
-            found[ours[plain][0]] = theirs[plain][0]
-    return found
-
-
-def name_hint(name, names):
-    """A hint at the name that may be meant, or nothing."""
-    stem = PurePosixPath(name).stem
-    close = [other for other in names if PurePosixPath(other).stem == stem]
-    close += difflib.get_close_matches(name, names, 1)
-    return f"; there is {close[0]!r}" if close else ""
-
-
-def open_model(folder, sparse):
-    """Reads a COLMAP model and finds the folder that holds most of its photos."""
-    photos = read_photos(sparse)
-    places = []
-    for place in (sparse, *sparse.parents):
-        places += [place / "images", place / "input", place]
-        if place == folder:
-            break
-    on_disk = [photo_files(place) for place in places]
-    matches = [match_names(photos, files) for files in on_disk]
-    best = max(range(len(places)), key=lambda i: len(matches[i]))
-    files = {name: on_disk[best][other] for name, other in matches[best].items()}
-    usable = [name for name in files if photos[name][0] is not None]  # with a camera
-    return SimpleNamespace(
-        sparse=sparse,
-        photos=photos,
-        images=places[best],
-        on_disk=list(on_disk[best]),
-        files=files,  # of the photos that are posed, and on disk
-        count=len(usable))
-
-
-def model_folders(folder):
-    return [path.parent for path in files_below(folder) if path.name == "images.bin"]
-
-
-def find_model(folder, command):
-    """The model in the folder with most photos; prints which photos and models it lacks.
-
-    command: how a model is made, for messages
-    """
-    models = [open_model(folder, sparse) for sparse in model_folders(folder)]
-    if not models and folder.name in ("images", "input"):
-        parent = Path(os.path.abspath(folder)).parent
-        check(not model_folders(parent),
-              f"{folder} has no COLMAP model, the folder around it has: give {parent}")
-    check(models,
-          f"{folder} has no binary COLMAP model: run {command}, or for a text model "
-          "colmap model_converter --output_type BIN")
-    best = max(models, key=lambda model: model.count)
-    check(best.photos,
-          f"{best.sparse} is an empty model, no photo is posed: delete it and run {command}")
-    lost = sorted(best.photos.keys() - best.files)
-    if lost:
-        hint = name_hint(lost[0], best.on_disk)
-        says = f"{len(lost)} photos of {best.sparse} are not on disk, such as {lost[0]!r}{hint}"
-        check(best.files, f"{says}: put them into {folder / 'images'}, or run {command}")
-        warn(says)
-    on_disk = max(len(model.on_disk) for model in models)
-    print(f"{best.images}: {on_disk} photos on disk, {len(best.files)} posed by {best.sparse}")
-    for model in models:
-        if model.photos.keys() != best.photos.keys():
-            print(f"left out is another model: {len(model.photos)} posed by {model.sparse}")
-    return best
-
-
-def read_table(path):
-    """Lines of a table of any separator, as lists of words."""
-    check(path.is_file(), f"the split file {path} is missing")
-    text = path.read_text("utf-8-sig", "surrogateescape")
-    lines = [line for line in text.splitlines() if line.strip()] or [""]
-    separator = max("\t;,", key=lines[0].count)
-    return [[word.strip(' "') for word in line.split(separator)] for line in lines]
-
-
-def split_files(folder, split):
-    """The table of the split, or train_list.txt and test_list.txt: named or in the folder."""
-    tables = [
-        path for path in sorted(folder.glob("[!.]*.[ct]sv"))
-        if "split" in read_table(path)[0]
-    ]
-    if not tables:
-        tables = list(folder.glob("train*.txt"))
-    if split:
-        tables = [Path(split)]
-    check(len(tables) < 2,
-          f"choose a split file by --split: {', '.join(map(str, tables))}")
-    if tables and tables[0].suffix == ".txt":
-        name = tables[0].name
-        tables = [
-            tables[0].with_name(re.sub("train|test", subset, name))
-            for subset in ("train", "test")
-        ]
-    return tables
-
-
-def read_split(tables):
-    """{name: whether it is held out} of what split_files finds.
-
-    A table has NeRF-W's columns; rows with an empty id do not count.
-    """
-    path = tables[0]
-    if len(tables) == 2:
-        rows = [
-            dict(filename=words[0], split=subset)
-            for subset, names in zip(("train", "test"), tables)
-            for words in read_table(names)
-        ]
-    else:
-        head, *lines = read_table(path)
-        check("filename" in head and "split" in head,
-              f"{path} needs a header with filename and split")
-        rows = [dict(zip(head, words)) for words in lines]
-    held_out = {}
-    for row in rows:
-        if row.get("id") == "":
-            continue
-        name = row.get("filename")
-        subset = row.get("split")
-        is_test = subset == "test"
-        check(name and subset in ("train", "test") and held_out.get(name, is_test) == is_test,
-              f"{path}: {name!r} is {subset!r}; each is train or test, and not both")
-        held_out[name] = is_test
-    return held_out
-
-
-def choose_held_out(folder, names, tables):
-    """{name: whether it is held out} of the photos that are to be used; tells the rule."""
-    if not tables:
-        print(f"{folder} has no split file: every eighth photo is held out")
-        return {name: i % 8 == 7 for i, name in enumerate(names)}
-    print(f"split by {tables[0]}")
-    held_out = read_split(tables)
-    matches = match_names(held_out, names)
-    held_out = {matches.get(name, name): is_test for name, is_test in held_out.items()}
-    rest = set(names) - held_out.keys()
-    if rest:
-        warn(f"{len(rest)} photos are not in {tables[0]}: {min(rest)} ...")
-    return held_out
-
-
-def checksum(paths, start=0):
-    """CRC-32 over the content of the files that exist."""
-    for path in paths:
-        if path.is_file():
-            start = zlib.crc32(path.read_bytes(), start)
-    return start
-
-
-def photos_checksum(files, masks, start=0):
-    """CRC-32 over the photos' names and content and their masks. files, masks: {name: path}"""
-    for name in sorted(files):
-        start = zlib.crc32(os.fsencode(name), start)
-        paths = [files[name]]
-        if name in masks:
-            paths.append(masks[name])
-        start = checksum(paths, start)
-    return start
-
-
-def fingerprint(info):
-    """CRC-32 over the content of all files that a scene is read from, wherever they lie."""
-    folder = Path(info["folder"])
-    images = Path(info["images"])
-    models = [
-        sparse / name
-        for sparse in model_folders(folder)
-        for name in ("cameras.bin", "images.bin", "points3D.bin")
-    ]
-    there = photo_files(images)
-    files = {
-        name: there[other] for name, other in match_names(info["posed"], there).items()}
-    masks = mask_files(images, files)
-    start = checksum([*models, *split_files(folder, info["split"])])
-    return photos_checksum(files, masks, start)
-
-
-def is_heic(path):
-    """Whether a file is HEIC, by its content; phones often name it .jpg."""
-    with open(path, "rb") as file:
-        head = file.read(12)
-    return head[4:8] == b"ftyp" and head[8:] in (b"heic", b"heix", b"mif1", b"msf1")
-
-
-def is_cut_off(data):
-    """Whether a JPEG or PNG file lacks its end, which OpenCV does not report."""
-    if data[1:4] == b"PNG":
-        return b"IEND" not in data
-    last_scan = data.rfind(b"\xff\xda")
-    end_mark = data.rfind(b"\xff\xd9")
-    return data[:2] == b"\xff\xd8" and end_mark < last_scan
-
-
-def decode(data, flags):
-    """The decoded image, or None."""
-    try:
-        return cv2.imdecode(np.frombuffer(data, np.uint8), flags)
-    except cv2.error:  # empty, or more than a gigapixel
-        return None
-
-
-def undistort(image, camera):
-    """An image (h,w) or (h,w,3) as a pinhole camera sees it, and its K (4,)."""
-    wh, K, distortion = camera
-    if not distortion.any():
-        return image, K
-    fx, fy, cx, cy = K - (0, 0, 0.5, 0.5)  # OpenCV's first pixel is at 0
-    M = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-    P, _ = cv2.getOptimalNewCameraMatrix(M, distortion, wh, 0)  # 0: nothing but photo
-    image = cv2.undistort(image, M, distortion, None, P)
-    return image, np.array([P[0, 0], P[1, 1], P[0, 2] + 0.5, P[1, 2] + 0.5])
-
-
-def read_photo(path, camera, downscale):
-    """Reads, undistorts and downscales a photo. -> rgb uint8 (h,w,3), K (4,)"""
-    w, h = camera[0]
-    check(1 <= downscale <= min(w, h) / 2, f"is {w} x {h}: choose another --downscale")
-    check(path.is_file(), "is a broken link: copy the photo itself")
-    check(not is_heic(path), "is HEIC, which cannot be read: convert it to JPEG")
-    data = path.read_bytes()
-    check(not is_cut_off(data), "is cut off: copy it again")
-    image = decode(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-    check(image is not None,
-          "is empty, damaged, too large or no photo of a known type: replace it")
-    stored = image.shape[1::-1]
-    if stored != (w, h):
-        image = decode(data, cv2.IMREAD_COLOR)
-    size = image.shape[1::-1]
-    tag = "" if size == stored else f", {size[0]} x {size[1]} by its EXIF orientation tag"
-    check(size == (w, h),
-          f"has {stored[0]} x {stored[1]} pixels{tag}, its camera {w} x {h}: put back what "
-          "SfM saw")
-    image, K = undistort(image, camera)
-    small = w // downscale, h // downscale
-    image = cv2.resize(image, small, interpolation=cv2.INTER_AREA)
-    return image[..., ::-1], K * (small * 2) / (w, h, w, h)
-
-
-def read_mask(path, size):
-    """Reads a mask and scales it to its photo's size (w, h).
-
-    -> uint8 (h,w): 0 is left out, 255 is not
-    """
-    mask = decode(path.read_bytes(), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
-    check(mask is not None, "is no image")
-    mask = np.where(mask < 128, 0, 255).astype(np.uint8)
-    h, w = mask.shape
-    check(abs(w * size[1] / (h * size[0]) - 1) < 0.02,
-          f"has {w} x {h} pixels, its photo {size[0]} x {size[1]}")
-    check(mask.any(), "is black all over; 255 is white")
-    return cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST)
-
-
-def read_masks(model, usable):
-    """The pixels that are left out of each usable photo: a list of (h,w) bool, or None."""
-    paths = mask_files(model.images, usable)
-    masks = []
-    used = 0
-    for name, (image, *_) in usable.items():
-        h, w = image.shape[:2]
-        masked = np.zeros((h, w), bool)
-        if name in paths:
-            camera = model.photos[name][0]
-            try:
-                mask, _ = undistort(read_mask(paths[name], camera[0]), camera)
-                mask = cv2.resize(mask, (w, h), interpolation=cv2.INTER_AREA)
-                masked = mask < 128
-                used += 1
-            except UserError as e:
-                warn(f"mask not used: {paths[name]} {e}")
-        masks.append(masked)
-    if not used:
-        return None
-    black = np.mean(np.concatenate([masked.ravel() for masked in masks]))
-    print(f"{used} of {len(masks)} photos have a mask: {black:.0%} of all pixels are black "
-          "and left out")
-    return masks
-
-
-def read_usable(model, points, rows, held_out, downscale):
-    """{name: (rgb, K, c2w, rows of its points)} of the photos that can be used.
-
-    Tells which cannot, and why.
-    """
-    usable = {}
-    misfits = {}  # photos that miss most of the points that they should see
-    for name in progress(sorted(held_out), "preparing photos"):
-        try:
-            check(name in model.photos, f"has no pose{name_hint(name, model.files)}")
-            check(name in model.files, f"is not on disk{name_hint(name, model.on_disk)}")
-            camera, pose, ids = model.photos[name]
-            check_photo(camera, pose, held_out[name])
-            image, K = read_photo(model.files[name], camera, downscale)
-        except UserError as e:
-            warn(f"left out: {name} {e}")
-            continue
-        c2w = camera_to_world(pose)
-        track = np.array([rows[key] for key in ids if key in rows], int)
-        uv, _ = project(K, c2w, points[track, :3])
-        is_inside = is_in_photo(uv, image.shape[1::-1])
-        if len(track) and is_inside.mean() < 0.5:
-            misfits[name] = is_inside.mean()
-        usable[name] = image, K, c2w, track
-    check(2 * len(misfits) <= len(usable),
-          f"{len(misfits)} of {len(usable)} photos miss most of their points: give poses as "
-          "COLMAP does, world to camera, x right, y down, z forward, in the units of the points")
-    for name, share in misfits.items():
-        warn(f"left out: {name} shows {share:.0%} of its points: its pose or its distortion "
-             "is wrong")
-        del usable[name]
-    lost = [name for name in held_out if held_out[name] and name not in usable]
-    check(not lost,
-          f"held-out photos cannot be used, repair them or hold out others: {lost}")
-    count = sum(not held_out[name] for name in usable)
-    check(count >= 2,
-          f"{count} usable training photos are too few: repair them or the split file")
-    return usable
-
-
-def prepare(name, downscale=2, split=None):
-    """Scene of one of SCENES, or of a folder with photos and a COLMAP model; see FORMAT."""
-    folder = Path(name)
-    command = f"python data_prep.py {name} --sfm"
-    if name in SCENES:
-        folder = DATA / name
-        command = f"python data_prep.py {name} --download"
-        if not folder.is_dir():
-            folder = DATA / SCENES[name][0]
-    model = find_model(folder, command)
-    split = os.path.abspath(split) if split else None
-    info = dict(
-        scene=folder.resolve().name,
-        kind="colmap",
-        downscale=downscale,
-        folder=str(folder),
-        images=str(model.images),
-        posed=sorted(model.photos),
-        split=split)
-    info["files"] = fingerprint(info)
-    tables = split_files(folder, split)
-    held_out = choose_held_out(folder, sorted(model.files), tables)
-    points, rows = read_points(model.sparse)
-    usable = read_usable(model, points, rows, held_out, downscale)
-    masks = read_masks(model, usable)
-    images, K, c2w, tracks = zip(*usable.values())
-    is_test = [held_out[name] for name in usable]
-    scene = build_scene(
-        images, K, c2w, is_test, list(usable), points, tracks, info, masks=masks)
-    spread = [
-        np.std(scene["track_uv"][scene["track_photo"] == i], axis=0).max()
-        for i in np.unique(scene["track_photo"])
-    ]
-    check(np.median(spread) > 0.02,
-          "the points of a photo lie on one spot of it: give poses in the units of the points")
-    inside = (lengths(scene["points"]) < 1).mean()
-    print(f"the sphere has a radius of {scene['scale']:.3g} units of the reconstruction; "
-          f"{inside:.0%} of the points are inside")
-    return scene
-
-
-def scene_path(name_or_folder):
-    """data/<scene>.npz; of two folders with one name each has its own."""
-    folder = Path(name_or_folder).resolve()
-    mark = ""
-    if name_or_folder not in ("toy", *SCENES):
-        mark = f"-{zlib.crc32(os.fsencode(folder)):08x}"
-    return DATA / f"{folder.name}{mark}.npz"
-
-
-def open_scene(name_or_folder, downscale=2):
-    """Scene from its file: made on first use, and anew if the content of a source differs."""
-    path = scene_path(name_or_folder)
-    split = None
-    if path.exists():
-        scene = read_scene(path)
-        info = json.loads(str(scene["info"]))
-        split = info["split"]  # named once, by --split
-        if info["kind"] == "toy" or (info["downscale"] == downscale and is_fresh(info)):
-            return scene
-    print(f"making {path}")
-    if name_or_folder == "toy":
-        scene = make_toy()
-    else:
-        scene = prepare(name_or_folder, downscale, split)
-    write_scene(path, scene)
-    return scene
-
-
-def is_fresh(info):
-    """Whether a scene's sources are unchanged, or gone: a scene file needs none of them."""
-    if not Path(info["folder"]).is_dir():
-        return True
-    return "posed" in info and info["files"] == fingerprint(info)
 
 
 # ---- download, SfM, command line -------------------------------------------------------
