@@ -301,171 +301,6 @@ def test_a_failed_write_leaves_the_old_file(tmp_path):
     assert os.listdir(path.parent) == ["scene.npz"]
 
 
-# ---- the toy -------------------------------------------------------------------------------------
-def scene_sdf(scene, x, **knobs):
-    """Signed distance of the toy at x (P,3), both in scene units -> (P,)"""
-    return data_prep.toy_sdf(world(scene, x), **knobs) / scene["scale"]
-
-
-@pytest.mark.parametrize("number", [1, 3, 10])
-def test_every_landmark_is_another_building(number):
-    parts = data_prep.toy_landmark(number)
-    first = data_prep.toy_landmark(0)
-    shift = [lengths(a.center - np.array(b.center)) for a, b in zip(parts, first)]
-    assert max(shift) > .1
-    assert [part.material for part in parts] != [part.material for part in first]
-
-
-@pytest.mark.parametrize("number", [1, 3, 10])
-def test_no_part_hangs_in_the_air(number):
-    parts = data_prep.toy_landmark(number)
-    for part in parts:
-        foot = np.array([part.center]) - [0, 0, part.half[2]]
-        others = [other for other in parts + data_prep.TOWN if other is not part]
-        assert min(data_prep.part_sdf(other, foot)[0] for other in others) < .02
-
-
-@pytest.mark.parametrize("number", [0, 4])
-def test_a_landmark_fills_the_unit_sphere(number):
-    scene = toy(landmark=number)
-    x = np.random.default_rng(0).uniform(-1.5, 1.5, (60_000, 3))
-    distance = scene_sdf(scene, x, background=False, landmark=number)
-    reach = lengths(x[distance < 0]).max()
-    assert .75 < reach < 1
-
-
-@cases(
-    "shape, top, x, distance",
-    ground=("ground", 3, (1, 2, .5), .5),
-    corner=("box", 3, (5, 5, 7), 7),
-    inside=("box", 3, (1, 0, .5), -.5),
-    # 3-4-5 triangles: the slanted side falls 1.5 over 2.
-    roof=("box", 1.5, (6.25, 0, 3), 5),
-    cone=("column", 1.5, (0, 6.25, 3), 5),
-    upper_edge=("column", 3, (4.2, 5.6, 4), 5),
-    ball=("ball", 3, (3, 4, 12), 10))
-def test_distances_to_parts_equal_closed_forms(shape, top, x, distance):
-    center = np.array([10, 20, 30])
-    part = data_prep.Part(shape, center, half=(3, 2, 1), material="gold", top=top)
-    assert_arrays_close(data_prep.part_sdf(part, np.array([center + x])), distance)
-
-
-@cases("i, knobs", town=(4, {}), alone=(3, dict(background=False)), other=(2, dict(landmark=4)))
-def test_depth_is_where_the_distance_vanishes(i, knobs):
-    scene = toy(**knobs)
-    c2w = scene["c2w"][i]
-    d = data_prep.ray_directions(scene["K"][i], c2w, *scene["wh"][i])
-    t = np.zeros(len(d))
-    for _ in range(300):  # sphere tracing
-        x = c2w[:, 3] + t[:, None] * d
-        t += scene_sdf(scene, x, **knobs)
-    depth = photo(scene, i, "depth").ravel()
-    assert_arrays_close(np.minimum(t, 6), np.minimum(depth, 6), atol=.01)
-
-
-def test_rays_end_on_the_part_they_hit():
-    parts = data_prep.toy_parts(0)
-    o = np.array([[0, -4.0, 1]])
-    d = np.random.default_rng(0).uniform(-1, 1, (999, 3))
-    t, which = data_prep.trace(o, d, parts)
-    x = o + np.minimum(t, 20)[:, None] * d
-    distance = [data_prep.part_sdf(parts[i], x[n:n + 1])[0] for n, i in enumerate(which)]
-    assert len(np.unique(which)) > 9
-    assert_arrays_close(np.array(distance)[t < 20], 0)
-
-
-def test_surface_truth_agrees_with_the_distance_function():
-    scene = toy()
-    before = scene["wall"] + .004 * scene["wall_normal"]
-    assert_arrays_close(np.median(scene_sdf(scene, before)), .004, atol=1e-4)
-    assert_arrays_close(scene_sdf(scene, scene["near_wall"]), scene["near_wall_sdf"])
-    assert np.abs(scene["near_wall_sdf"]).max() < .05
-
-
-def test_the_ground_behind_a_tower_is_darker():
-    parts = data_prep.toy_parts(0)
-    o = np.array([[1.6, 1.1, 5], [.1, -.75, 5]])  # above the ground behind and before it
-    d = np.array([[1e-6, 1e-6, -1]] * 2)
-    behind, before = data_prep.shade(o, d, parts, True, data_prep.SUN, np.zeros(4)).mean(1)
-    assert behind < .6 * before
-
-
-def test_sun_changes_only_colours():
-    plain = toy(exposure=0.0)
-    other = toy(exposure=0.0, sun=90.0)
-    changed = np.abs(plain["rgb"].astype(float) - other["rgb"]).max(1) > 20
-    is_sky = np.isinf(plain["depth"])
-    assert_same_arrays(plain, other, "c2w", "points", "depth", "occluder", "track_point")
-    assert changed.mean() > .05
-    assert changed[is_sky].mean() < .1 * changed.mean()
-
-
-def test_photos_differ_in_exposure_by_the_knob():
-    plain, usual, extreme = [toy(exposure=knob)["exposure_spread"] for knob in (0.0, 1.0, 2.0)]
-    assert plain < .5 * usual
-    assert usual < .6 * extreme
-
-
-def test_people_cover_their_share_of_training_photos():
-    plain = toy(exposure=0.0, occluders=0.0, photos=16)
-    other = toy(exposure=0.0, occluders=.3, photos=16)
-
-    people = other["occluder"]
-    before = plain["rgb"].astype(float)
-    assert np.array_equal(before[~people], other["rgb"][~people])
-    assert (other["rgb"] > before + 50)[people].mean() > .05  # in colours
-
-    shares = np.array([photo(other, i, "occluder").mean() for i in range(18)])
-    training = shares[~other["is_test"]]
-    assert .21 < training.mean() < .48  # asked for: .3
-    assert training.max() > 2 * training.min()
-    assert not shares[other["is_test"]].any()
-
-
-def test_points_lie_on_surfaces_in_plain_view():
-    scene = toy(size=48, photos=12, occluders=.3)
-    miss = np.abs(scene_sdf(scene, scene["points"].astype(float)))
-    assert len(miss) > 1000
-    assert .001 < np.median(miss) < .006  # noise
-    assert .0005 < (miss > .03).mean() < .05  # outliers
-    seen_by = scene["track_photo"]
-    x = scene["points"][scene["track_point"]]
-    distance = lengths(x - scene["c2w"][seen_by, :, 3])
-    wh = scene["wh"][seen_by]
-    u, v = np.clip(scene["track_uv"] * wh, 0, wh - 1).astype(int).T
-    pixel = scene["start"][seen_by] + v * wh[:, 0] + u
-    is_behind = scene["depth"][pixel] < .8 * distance
-    is_hidden = is_behind | scene["occluder"][pixel]
-    assert np.bincount(scene["track_point"]).min() >= 2
-    assert is_hidden.mean() < .12
-
-
-def test_cameras_stand_upright():
-    down = toy(pose_noise=3.0)["c2w"][:, :, 1]
-    assert down[:, 2].max() < -.5
-
-
-def test_pose_noise_moves_training_cameras_only():
-    clean = toy()
-    noisy = toy(pose_noise=3.0)
-    is_moved = (clean["c2w"] != noisy["c2w"]).any((1, 2))
-    assert_same_arrays(clean, noisy, "rgb", "points", "center")
-    assert np.array_equal(is_moved, ~clean["is_test"])
-
-
-def test_pose_noise_is_in_pixels_rms():
-    rng = np.random.default_rng(0)
-    K = np.array([50, 50, 16, 16])
-    shift = []
-    for _ in range(500):
-        c2w = np.eye(3, 4)
-        c2w[2, 3] = -4  # looks at the landmark
-        data_prep.add_pose_noise(rng, K, c2w, 2.0)
-        uv, _ = data_prep.project(K, c2w, np.zeros((1, 3)))
-        shift.append(lengths(uv - 16))
-    assert abs(np.mean(np.square(shift)) - 4) < .4
-
-
 # ---- the sphere ----------------------------------------------------------------------------------
 def ball(count):
     """Random points of the unit ball (count,3)"""
@@ -997,44 +832,28 @@ def test_thumbnails_and_masks_are_no_photos(in_tmp_dir, source):
     assert "place/images: 10 photos on disk, 10 posed" in run_main("place")[1]
 
 
-# ---- masks ---------------------------------------------------------------------------------------
-BLACK_LEFT = np.uint8([[0, 255]] * 2)
+# ---- damaged models ------------------------------------------------------------------------------
+@pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin"])
+def test_a_damaged_model_is_refused_in_little_memory(tmp_path, source, name):
+    model = colmap_model(source)
+    model.names = model.names[:2]
+    model.x = model.x[:3]
+    model.views[:3] = 2
+    model.sightings = np.zeros((2, 1), int)
+    write_model(model, tmp_path)
+    path = tmp_path / name
+    good = path.read_bytes()
 
-
-@pytest.mark.parametrize("folder", [IMAGES / "masks", MASKS], ids=["within", "beside"])
-@pytest.mark.parametrize("name, mask_name", [
-    ("toy_000.png", "toy_000.png"),
-    ("toy_000.jpg", "toy_000.png"),
-    ("toy_000.jpg", "toy_000.jpg.png"),
-    ("toy_000.jpg", "toy_000.jpg")])
-def test_black_pixels_of_masks_are_left_out(model, source, folder, name, mask_name):
-    change("names", 0, name)(model)
-    PHOTO.rename(IMAGES / name)
-    TABLE.unlink()
-    w, h = source["wh"][0]
-    mask = cv2.resize(BLACK_LEFT, (2 * w, 2 * h), interpolation=cv2.INTER_NEAREST)
-    put(folder / mask_name, encoded(mask, Path(mask_name).suffix))
-    code, out, err = run_main("place --downscale 1")
-    scene = data_prep.open_scene("place", 1)
-    masked = photo(scene, 0, "masked")
-    share = scene["masked"].mean()
-    assert f"1 of 10 photos have a mask: {share:.0%} of all pixels are black" in out
-    assert masked[:, :w // 2].all()
-    assert masked.sum() == scene["masked"].sum() == h * (w // 2)
-
-
-@cases(
-    "name, mask, says",
-    black=("toy_000.png", BLACK, "is black all over"),
-    nearly_black=("toy_000.png", BLACK + 1, "is black all over"),
-    turned=("toy_000.png", BLACK.T + 255, "has 27 x 40 pixels, its photo 40 x 27"),
-    of_no_photo=("other.png", BLACK + 255, "no name in it, such as other.png, is a photo's"))
-def test_a_mask_that_cannot_be_used_is_named(model, name, mask, says):
-    put(MASKS / name, encoded(mask))
-    code, out, err = run_main("place")
-    assert code == 0
-    assert says in err
-    assert "masked" not in data_prep.open_scene("place")
+    def read(data):
+        path.write_bytes(data)
+        return data_prep.read_photos(tmp_path), data_prep.read_points(tmp_path)
+    assert attempt(read, good)
+    for size in range(0, len(good), 3):
+        assert attempt(read, good[:size]) is None
+    for at in range(len(good) - 7):
+        for number in (2 ** 40, 2 ** 64 - 1):  # also as a count
+            _, size = peak(attempt, read, good[:at] + pack("Q", number) + good[at + 8:])
+            assert size < 2 ** 21
 
 
 # ---- split tables --------------------------------------------------------------------------------
@@ -1189,28 +1008,209 @@ def test_scenes_known_by_name_lie_in_data(in_tmp_dir, source, home):
     assert Path("data/sacre.npz").exists()
 
 
-# ---- damaged models ------------------------------------------------------------------------------
-@pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin"])
-def test_a_damaged_model_is_refused_in_little_memory(tmp_path, source, name):
-    model = colmap_model(source)
-    model.names = model.names[:2]
-    model.x = model.x[:3]
-    model.views[:3] = 2
-    model.sightings = np.zeros((2, 1), int)
-    write_model(model, tmp_path)
-    path = tmp_path / name
-    good = path.read_bytes()
+# ---- masks ---------------------------------------------------------------------------------------
+BLACK_LEFT = np.uint8([[0, 255]] * 2)
 
-    def read(data):
-        path.write_bytes(data)
-        return data_prep.read_photos(tmp_path), data_prep.read_points(tmp_path)
-    assert attempt(read, good)
-    for size in range(0, len(good), 3):
-        assert attempt(read, good[:size]) is None
-    for at in range(len(good) - 7):
-        for number in (2 ** 40, 2 ** 64 - 1):  # also as a count
-            _, size = peak(attempt, read, good[:at] + pack("Q", number) + good[at + 8:])
-            assert size < 2 ** 21
+
+@pytest.mark.parametrize("folder", [IMAGES / "masks", MASKS], ids=["within", "beside"])
+@pytest.mark.parametrize("name, mask_name", [
+    ("toy_000.png", "toy_000.png"),
+    ("toy_000.jpg", "toy_000.png"),
+    ("toy_000.jpg", "toy_000.jpg.png"),
+    ("toy_000.jpg", "toy_000.jpg")])
+def test_black_pixels_of_masks_are_left_out(model, source, folder, name, mask_name):
+    change("names", 0, name)(model)
+    PHOTO.rename(IMAGES / name)
+    TABLE.unlink()
+    w, h = source["wh"][0]
+    mask = cv2.resize(BLACK_LEFT, (2 * w, 2 * h), interpolation=cv2.INTER_NEAREST)
+    put(folder / mask_name, encoded(mask, Path(mask_name).suffix))
+    code, out, err = run_main("place --downscale 1")
+    scene = data_prep.open_scene("place", 1)
+    masked = photo(scene, 0, "masked")
+    share = scene["masked"].mean()
+    assert f"1 of 10 photos have a mask: {share:.0%} of all pixels are black" in out
+    assert masked[:, :w // 2].all()
+    assert masked.sum() == scene["masked"].sum() == h * (w // 2)
+
+
+@cases(
+    "name, mask, says",
+    black=("toy_000.png", BLACK, "is black all over"),
+    nearly_black=("toy_000.png", BLACK + 1, "is black all over"),
+    turned=("toy_000.png", BLACK.T + 255, "has 27 x 40 pixels, its photo 40 x 27"),
+    of_no_photo=("other.png", BLACK + 255, "no name in it, such as other.png, is a photo's"))
+def test_a_mask_that_cannot_be_used_is_named(model, name, mask, says):
+    put(MASKS / name, encoded(mask))
+    code, out, err = run_main("place")
+    assert code == 0
+    assert says in err
+    assert "masked" not in data_prep.open_scene("place")
+
+
+# ---- the toy -------------------------------------------------------------------------------------
+def scene_sdf(scene, x, **knobs):
+    """Signed distance of the toy at x (P,3), both in scene units -> (P,)"""
+    return data_prep.toy_sdf(world(scene, x), **knobs) / scene["scale"]
+
+
+@pytest.mark.parametrize("number", [1, 3, 10])
+def test_every_landmark_is_another_building(number):
+    parts = data_prep.toy_landmark(number)
+    first = data_prep.toy_landmark(0)
+    shift = [lengths(a.center - np.array(b.center)) for a, b in zip(parts, first)]
+    assert max(shift) > .1
+    assert [part.material for part in parts] != [part.material for part in first]
+
+
+@pytest.mark.parametrize("number", [1, 3, 10])
+def test_no_part_hangs_in_the_air(number):
+    parts = data_prep.toy_landmark(number)
+    for part in parts:
+        foot = np.array([part.center]) - [0, 0, part.half[2]]
+        others = [other for other in parts + data_prep.TOWN if other is not part]
+        assert min(data_prep.part_sdf(other, foot)[0] for other in others) < .02
+
+
+@pytest.mark.parametrize("number", [0, 4])
+def test_a_landmark_fills_the_unit_sphere(number):
+    scene = toy(landmark=number)
+    x = np.random.default_rng(0).uniform(-1.5, 1.5, (60_000, 3))
+    distance = scene_sdf(scene, x, background=False, landmark=number)
+    reach = lengths(x[distance < 0]).max()
+    assert .75 < reach < 1
+
+
+@cases(
+    "shape, top, x, distance",
+    ground=("ground", 3, (1, 2, .5), .5),
+    corner=("box", 3, (5, 5, 7), 7),
+    inside=("box", 3, (1, 0, .5), -.5),
+    # 3-4-5 triangles: the slanted side falls 1.5 over 2.
+    roof=("box", 1.5, (6.25, 0, 3), 5),
+    cone=("column", 1.5, (0, 6.25, 3), 5),
+    upper_edge=("column", 3, (4.2, 5.6, 4), 5),
+    ball=("ball", 3, (3, 4, 12), 10))
+def test_distances_to_parts_equal_closed_forms(shape, top, x, distance):
+    center = np.array([10, 20, 30])
+    part = data_prep.Part(shape, center, half=(3, 2, 1), material="gold", top=top)
+    assert_arrays_close(data_prep.part_sdf(part, np.array([center + x])), distance)
+
+
+@cases("i, knobs", town=(4, {}), alone=(3, dict(background=False)), other=(2, dict(landmark=4)))
+def test_depth_is_where_the_distance_vanishes(i, knobs):
+    scene = toy(**knobs)
+    c2w = scene["c2w"][i]
+    d = data_prep.ray_directions(scene["K"][i], c2w, *scene["wh"][i])
+    t = np.zeros(len(d))
+    for _ in range(300):  # sphere tracing
+        x = c2w[:, 3] + t[:, None] * d
+        t += scene_sdf(scene, x, **knobs)
+    depth = photo(scene, i, "depth").ravel()
+    assert_arrays_close(np.minimum(t, 6), np.minimum(depth, 6), atol=.01)
+
+
+def test_rays_end_on_the_part_they_hit():
+    parts = data_prep.toy_parts(0)
+    o = np.array([[0, -4.0, 1]])
+    d = np.random.default_rng(0).uniform(-1, 1, (999, 3))
+    t, which = data_prep.trace(o, d, parts)
+    x = o + np.minimum(t, 20)[:, None] * d
+    distance = [data_prep.part_sdf(parts[i], x[n:n + 1])[0] for n, i in enumerate(which)]
+    assert len(np.unique(which)) > 9
+    assert_arrays_close(np.array(distance)[t < 20], 0)
+
+
+def test_surface_truth_agrees_with_the_distance_function():
+    scene = toy()
+    before = scene["wall"] + .004 * scene["wall_normal"]
+    assert_arrays_close(np.median(scene_sdf(scene, before)), .004, atol=1e-4)
+    assert_arrays_close(scene_sdf(scene, scene["near_wall"]), scene["near_wall_sdf"])
+    assert np.abs(scene["near_wall_sdf"]).max() < .05
+
+
+def test_the_ground_behind_a_tower_is_darker():
+    parts = data_prep.toy_parts(0)
+    o = np.array([[1.6, 1.1, 5], [.1, -.75, 5]])  # above the ground behind and before it
+    d = np.array([[1e-6, 1e-6, -1]] * 2)
+    behind, before = data_prep.shade(o, d, parts, True, data_prep.SUN, np.zeros(4)).mean(1)
+    assert behind < .6 * before
+
+
+def test_sun_changes_only_colours():
+    plain = toy(exposure=0.0)
+    other = toy(exposure=0.0, sun=90.0)
+    changed = np.abs(plain["rgb"].astype(float) - other["rgb"]).max(1) > 20
+    is_sky = np.isinf(plain["depth"])
+    assert_same_arrays(plain, other, "c2w", "points", "depth", "occluder", "track_point")
+    assert changed.mean() > .05
+    assert changed[is_sky].mean() < .1 * changed.mean()
+
+
+def test_photos_differ_in_exposure_by_the_knob():
+    plain, usual, extreme = [toy(exposure=knob)["exposure_spread"] for knob in (0.0, 1.0, 2.0)]
+    assert plain < .5 * usual
+    assert usual < .6 * extreme
+
+
+def test_people_cover_their_share_of_training_photos():
+    plain = toy(exposure=0.0, occluders=0.0, photos=16)
+    other = toy(exposure=0.0, occluders=.3, photos=16)
+
+    people = other["occluder"]
+    before = plain["rgb"].astype(float)
+    assert np.array_equal(before[~people], other["rgb"][~people])
+    assert (other["rgb"] > before + 50)[people].mean() > .05  # in colours
+
+    shares = np.array([photo(other, i, "occluder").mean() for i in range(18)])
+    training = shares[~other["is_test"]]
+    assert .21 < training.mean() < .48  # asked for: .3
+    assert training.max() > 2 * training.min()
+    assert not shares[other["is_test"]].any()
+
+
+def test_points_lie_on_surfaces_in_plain_view():
+    scene = toy(size=48, photos=12, occluders=.3)
+    miss = np.abs(scene_sdf(scene, scene["points"].astype(float)))
+    assert len(miss) > 1000
+    assert .001 < np.median(miss) < .006  # noise
+    assert .0005 < (miss > .03).mean() < .05  # outliers
+    seen_by = scene["track_photo"]
+    x = scene["points"][scene["track_point"]]
+    distance = lengths(x - scene["c2w"][seen_by, :, 3])
+    wh = scene["wh"][seen_by]
+    u, v = np.clip(scene["track_uv"] * wh, 0, wh - 1).astype(int).T
+    pixel = scene["start"][seen_by] + v * wh[:, 0] + u
+    is_behind = scene["depth"][pixel] < .8 * distance
+    is_hidden = is_behind | scene["occluder"][pixel]
+    assert np.bincount(scene["track_point"]).min() >= 2
+    assert is_hidden.mean() < .12
+
+
+def test_cameras_stand_upright():
+    down = toy(pose_noise=3.0)["c2w"][:, :, 1]
+    assert down[:, 2].max() < -.5
+
+
+def test_pose_noise_moves_training_cameras_only():
+    clean = toy()
+    noisy = toy(pose_noise=3.0)
+    is_moved = (clean["c2w"] != noisy["c2w"]).any((1, 2))
+    assert_same_arrays(clean, noisy, "rgb", "points", "center")
+    assert np.array_equal(is_moved, ~clean["is_test"])
+
+
+def test_pose_noise_is_in_pixels_rms():
+    rng = np.random.default_rng(0)
+    K = np.array([50, 50, 16, 16])
+    shift = []
+    for _ in range(500):
+        c2w = np.eye(3, 4)
+        c2w[2, 3] = -4  # looks at the landmark
+        data_prep.add_pose_noise(rng, K, c2w, 2.0)
+        uv, _ = data_prep.project(K, c2w, np.zeros((1, 3)))
+        shift.append(lengths(uv - 16))
+    assert abs(np.mean(np.square(shift)) - 4) < .4
 
 
 # ---- downloads -----------------------------------------------------------------------------------
@@ -1330,43 +1330,6 @@ def test_damaged_archives_leave_nothing(server, damage):
     assert sorted(os.listdir("data")) == ["brandenburg.tsv", TAR]
 
 
-# ---- command line --------------------------------------------------------------------------------
-def test_the_command_line_has_every_knob(in_tmp_dir):
-    code, out, err = run_main(
-        "toy --size 32 --photos 6 --test 2 --no-background --occluders .2 --seed 1")
-    scene = data_prep.read_scene("data/toy.npz")
-    assert code == 0
-    assert "data/toy.npz: 8 photos, 2 of them" in out
-    assert_same_arrays(scene, toy(occluders=.2, background=False, seed=1))
-    assert (scene["K"] != toy()["K"]).any()  # of another seed
-
-
-WRONG = """
-toy --sizee 9, toy --siz 32, toy --size x, toy --size 15, toy --photos 3,
-toy --test -1, toy --seed -1, toy --landmark -1, toy --occluders .61,
-toy --exposure -1, toy --exposure 2.1, toy --pose_noise -1, toy --pose_noise nan,
-toy --pose_noise inf, toy --sun -1, toy --sun 181, toy --sky -1, toy --sky 1.1,
-toy --downscale 4, toy --split x.tsv, place --split x.tsv, place --downscale 0,
-place --downscale 16, place --size 9, brandenburg, nowhere, x --download
-"""
-
-
-@pytest.mark.parametrize("command", ["", *map(str.strip, WRONG.split(","))])
-def test_misspelt_commands_exit_with_2(model, command):
-    assert_error("error: ", command)
-
-
-@cases(
-    "happens, says",
-    ctrl_c=(KeyboardInterrupt, "stopped"),
-    sigterm=(lambda **knobs: signal.raise_signal(signal.SIGTERM), "stopped"),
-    full_disk=(OSError(28, "No space left"), "No space left"))
-def test_a_stop_is_one_sentence(in_tmp_dir, monkeypatch, happens, says):
-    make_toy = mock.create_autospec(data_prep.make_toy, side_effect=happens)
-    monkeypatch.setattr(data_prep, "make_toy", make_toy)
-    assert_error(says, "toy")
-
-
 # ---- SfM -----------------------------------------------------------------------------------------
 @pytest.fixture
 def raw(in_tmp_dir, source):
@@ -1459,6 +1422,43 @@ def no_match(raw):
 def test_sfm_tells_what_is_wrong(pycolmap, raw, spoil, says):
     spoil(raw)  # after the stand-in, which monkeypatch removes
     assert_error(says, "raw --sfm")
+
+
+# ---- command line --------------------------------------------------------------------------------
+def test_the_command_line_has_every_knob(in_tmp_dir):
+    code, out, err = run_main(
+        "toy --size 32 --photos 6 --test 2 --no-background --occluders .2 --seed 1")
+    scene = data_prep.read_scene("data/toy.npz")
+    assert code == 0
+    assert "data/toy.npz: 8 photos, 2 of them" in out
+    assert_same_arrays(scene, toy(occluders=.2, background=False, seed=1))
+    assert (scene["K"] != toy()["K"]).any()  # of another seed
+
+
+WRONG = """
+toy --sizee 9, toy --siz 32, toy --size x, toy --size 15, toy --photos 3,
+toy --test -1, toy --seed -1, toy --landmark -1, toy --occluders .61,
+toy --exposure -1, toy --exposure 2.1, toy --pose_noise -1, toy --pose_noise nan,
+toy --pose_noise inf, toy --sun -1, toy --sun 181, toy --sky -1, toy --sky 1.1,
+toy --downscale 4, toy --split x.tsv, place --split x.tsv, place --downscale 0,
+place --downscale 16, place --size 9, brandenburg, nowhere, x --download
+"""
+
+
+@pytest.mark.parametrize("command", ["", *map(str.strip, WRONG.split(","))])
+def test_misspelt_commands_exit_with_2(model, command):
+    assert_error("error: ", command)
+
+
+@cases(
+    "happens, says",
+    ctrl_c=(KeyboardInterrupt, "stopped"),
+    sigterm=(lambda **knobs: signal.raise_signal(signal.SIGTERM), "stopped"),
+    full_disk=(OSError(28, "No space left"), "No space left"))
+def test_a_stop_is_one_sentence(in_tmp_dir, monkeypatch, happens, says):
+    make_toy = mock.create_autospec(data_prep.make_toy, side_effect=happens)
+    monkeypatch.setattr(data_prep, "make_toy", make_toy)
+    assert_error(says, "toy")
 
 
 # ---- models and rays for tests -------------------------------------------------------------------
