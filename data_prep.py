@@ -64,9 +64,9 @@ FORMAT = dict(
     name=("<U", ["photos"]),
     near=("float32", ["photos"]),  # distance at which the photo's content begins
     points=("float32", ["points", 3]),  # of SfM
-    track_photo=("int32", ["sightings"]),  # sorted; this photo sees
-    track_point=("int32", ["sightings"]),  # this point
-    track_uv=("float32", ["sightings", 2]),  # there, over wh: in 0..1 if inside
+    track_photo=("int32", ["observations"]),  # sorted by photo: index of the photo
+    track_point=("int32", ["observations"]),  # index of the point
+    track_uv=("float32", ["observations", 2]),  # (u / w, v / h): 0..1 inside, clipped to -1..2
     center=("float64", [3]),  # SfM units are x * scale + center
     scale=("float64", []),
     footprint=("float64", []),  # a typical pixel's size on the landmark
@@ -79,12 +79,13 @@ OPTIONAL = dict(
     # Of toys: the truth.
     depth=("float16", ["pixels"]),  # distance; inf is sky
     occluder=("bool", ["pixels"]),  # a person
-    wall=("float64", ["walls", 3]),  # visible points where the surface is smooth
-    wall_normal=("float64", ["walls", 3]),
-    near_wall=("float64", ["near walls", 3]),  # points near surfaces
-    near_wall_sdf=("float64", ["near walls"]),  # signed distance there, + outside
+    wall=("float64", ["surface points", 3]),  # visible, where the surface is smooth
+    wall_normal=("float64", ["surface points", 3]),
+    near_wall=("float64", ["points near surfaces", 3]),
+    near_wall_sdf=("float64", ["points near surfaces"]),  # signed distance, + outside
 )
-FAR = 1e9  # sound reconstructions have no larger number; float32 holds its square
+MAX_NUMBER = 1e9  # sound reconstructions have none larger; float32 holds its square
+EPSILON = 1e-9  # a smaller depth, radius or focal length counts as zero
 
 
 class UserError(Exception):
@@ -103,7 +104,7 @@ def warn(message):
 def allow_any_character():
     """From now on a character that the terminal lacks is printed as its code."""
     for stream in (sys.stdout, sys.stderr):
-        if hasattr(stream, "reconfigure"):  # a notebook's has not, and knows all
+        if hasattr(stream, "reconfigure"):  # a notebook's streams print any character
             stream.reconfigure(errors="backslashreplace")
 
 
@@ -133,8 +134,7 @@ def atomic_write(path, write):
     temporary = path.with_name(f".{path.stem}.{os.getpid()}.{time.time_ns()}{path.suffix}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        result = write(temporary)
-        check(result is not False, f"cannot encode {path}")  # so cv2.imwrite says no
+        write(temporary)
         temporary.replace(path)
     except OSError as e:
         says = f"cannot write {path} ({e.strerror or e}): free or choose a place"
@@ -144,33 +144,34 @@ def atomic_write(path, write):
 
 
 def write_scene(path, scene):
-    """Not compressed: a third larger, but six times faster to write."""
+    """Writes the file uncompressed: a third larger, but six times faster."""
     atomic_write(path, lambda temporary: np.savez(temporary, **scene))
 
 
 def refuse_bomb(path):
-    """UserError for a zip file that is larger inside than outside: ours never are."""
+    """UserError for a zip bomb: unpacked larger than the file, which ours never are."""
     with zipfile.ZipFile(path) as file:
-        inside = sum(member.file_size for member in file.infolist())
-    check(inside <= os.path.getsize(path), f"{path} is larger inside than outside")
+        unpacked = sum(member.file_size for member in file.infolist())
+    check(unpacked <= os.path.getsize(path), f"{path} is larger inside than outside")
 
 
 def check_scene(scene):
-    """UserError unless the arrays fit FORMAT and each other."""
+    """UserError with the name of the first bad array; read_scene turns it into a sentence."""
     sizes = {
         "photos": len(scene["wh"]),
         "photos + 1": len(scene["wh"]) + 1,
         "pixels": len(scene["rgb"]),
         "points": len(scene["points"]),
-        "sightings": len(scene["track_photo"]),
-        "walls": len(scene.get("wall", ())),
-        "near walls": len(scene.get("near_wall", ())),
+        "observations": len(scene["track_photo"]),
+        "surface points": len(scene.get("wall", ())),
+        "points near surfaces": len(scene.get("near_wall", ())),
     }
     optional = {key: OPTIONAL[key] for key in OPTIONAL.keys() & scene}
     for key, (dtype, shape) in (FORMAT | optional).items():
         value = scene[key]
         shape = tuple(sizes.get(size, size) for size in shape)
-        check(value.shape == shape and str(value.dtype).startswith(dtype), key)
+        has_dtype = str(value.dtype).startswith(dtype)  # "<U" fits a text of any length
+        check(value.shape == shape and has_dtype, key)
         if dtype.startswith("float") and key not in ("bg_color", "depth"):
             check(np.isfinite(value).all(), key)
     for key, count in [("track_photo", sizes["photos"]), ("track_point", sizes["points"])]:
@@ -213,11 +214,11 @@ def ray_directions(K, c2w, w, h, offset=(0.5, 0.5)):
 
 
 def project(K, c2w, x):
-    """Pixels (P,2), -1e9 behind the camera, and distances (P,) of points x (P,3)."""
+    """Pixels (P,2) and distances (P,) of points x (P,3). Behind the camera uv is -MAX_NUMBER."""
     p = (x - c2w[:, 3]) @ c2w[:, :3]
     z = p[:, 2:]
-    uv = p[:, :2] / np.maximum(z, 1 / FAR) * K[:2] + K[2:]
-    return np.where(z > 0, uv, -1e9), lengths(p)
+    uv = p[:, :2] / np.maximum(z, EPSILON) * K[:2] + K[2:]
+    return np.where(z > 0, uv, -MAX_NUMBER), lengths(p)
 
 
 def is_in_photo(uv, wh):
@@ -230,550 +231,60 @@ def pixel_index(uv, wh):
     return np.clip(uv, 0, np.subtract(wh, 1)).astype(int) @ (1, wh[0])
 
 
-# ---- the toy: z up, front towards -y, in its own units ---------------------------------
-TOY_SCALE = 3.7  # world = TOY_SCALE * x + TOY_ORIGIN
-TOY_ORIGIN = np.array([12.0, -7.0, 5.0])
-SUN = np.array([-0.50, -0.62, 0.60])  # left, behind the tourists
-SUN /= np.linalg.norm(SUN)
-
-
-class Material(NamedTuple):
-    colour: tuple
-    cell: tuple  # width and height of a stone, or of the wall around a window
-    contrast: float  # between cells
-    has_windows: bool = False
-
-
-MATERIALS = dict(
-    stone=Material((0.5, 0.46, 0.4), (0.29, 0.13), 0.2),
-    pale=Material((0.8, 0.74, 0.6), (0.29, 0.13), 0.08),
-    sand=Material((0.78, 0.56, 0.3), (0.3, 0.3), 0.15, has_windows=True),
-    brick=Material((0.52, 0.19, 0.11), (0.3, 0.3), 0.15, has_windows=True),
-    tiles=Material((0.6, 0.22, 0.12), (0.16, 0.08), 0.3),
-    slate=Material((0.12, 0.19, 0.31), (0.2, 0.1), 0.25),
-    copper=Material((0.16, 0.46, 0.36), (0.5, 0.5), 0.4),
-    gold=Material((0.9, 0.58, 0.08), (0.5, 0.5), 0),
-    plaster=Material((0.6, 0.46, 0.34), (0.62, 0.62), 0.15, has_windows=True),
-    leaf=Material((0.1, 0.22, 0.05), (0.2, 0.2), 0.45),
-    paving=Material((0.48, 0.42, 0.34), (0.42, 0.42), 0.2),
-    meadow=Material((0.17, 0.22, 0.08), (0.6, 0.6), 0.1),
-)
-# Other landmarks may swap materials within a group.
-INTERCHANGEABLE = [("stone", "pale"), ("sand", "brick"), ("tiles", "slate", "copper")]
-
-
-class Part(NamedTuple):
-    shape: str  # "ground", "ball", "column" (or cone), "box" (or roof)
-    centre: tuple
-    half: tuple  # half width, depth and height; a ball's or column's radius
-    material: str
-    top: float = None  # half width at the top; None is the same as at the bottom
-
-    @property
-    def widths(self):
-        """Half width at the bottom and at the top."""
-        bottom = self.half[0]
-        return bottom, bottom if self.top is None else self.top
-
-
-PLINTH = [
-    Part("box", centre=(-.01, -.03, .05), half=(.96, .53, .05), material="stone"),
-    Part("box", centre=(-.05, 0, .15), half=(.85, .47, .05), material="stone"),
-]
-COLUMNS = [
-    Part("column", centre=(x, -.34, .47), half=(.062, .062, .27), top=.05, material="pale")
-    for x in np.linspace(-.54, .60, 6)
-]
-HALL = COLUMNS + [
-    Part("box", centre=(.03, .2, .53), half=(.59, .26, .33), material="sand"),
-    Part("box", centre=(.03, .03, .8), half=(.67, .46, .06), material="pale"),
-    Part("box", centre=(.03, .03, .98), half=(.71, .48, .12), top=0, material="tiles"),
-]
-DOME = [
-    Part("column", centre=(-.05, .22, 1.07), half=(.33, .33, .17), top=.31, material="sand"),
-    Part("ball", centre=(-.05, .22, 1.24), half=(.3, .3, .3), material="copper"),
-    Part("column", centre=(-.05, .22, 1.57), half=(.075, .075, .07), top=.065, material="pale"),
-    Part("column", centre=(-.05, .22, 1.7), half=(.1, .1, .06), top=.02, material="copper"),
-    Part("ball", centre=(-.05, .22, 1.78), half=(.045, .045, .045), material="gold"),
-]
-TOWER = [
-    Part("box", centre=(.87, .18, .53), half=(.17, .17, .53), material="brick"),
-    Part("box", centre=(.87, .18, 1.1), half=(.2, .2, .04), material="pale"),
-    Part("column", centre=(.87, .18, 1.32), half=(.2, .2, .18), top=0, material="slate"),
-]
-ANNEX = [
-    Part("box", centre=(-.76, .24, .38), half=(.19, .25, .18), material="brick"),
-    Part("box", centre=(-.76, .24, .65), half=(.23, .28, .09), top=0, material="slate"),
-]
-STATUE = [
-    Part("box", centre=(-.8, -.35, .28), half=(.09, .09, .08), material="pale"),
-    Part("column", centre=(-.8, -.35, .48), half=(.07, .07, .12), top=.04, material="copper"),
-    Part("ball", centre=(-.8, -.35, .64), half=(.055, .055, .055), material="copper"),
-]
-# Houses around: x, y, half width, half height; a tree stands before each.
-HOUSES = [
-    (-7.5, 2, .6, .75), (-6.2, 4.4, .5, .55), (-4, 6.4, .8, .9), (-1.2, 7.6, .5, 1.15),
-    (2, 6.8, .7, .7), (4.6, 5.6, .5, .95), (6.8, 3, .6, .65), (7.4, 0, .5, .85),
-]
-TOWN = [Part("ground", centre=(0, 0, 0), half=(1, 1, 1), material="paving")]
-for x, y, wide, tall in HOUSES:
-    crown = 0.8 * wide
-    TOWN += [
-        Part("box", centre=(x, y, tall), half=(wide, wide, tall), material="plaster"),
-        Part("box", centre=(x, y, 2 * tall + .25), half=(wide, wide, .25), top=0, material="slate"),
-        Part("ball", centre=(.8 * x + 1, .7 * y, crown + .2), half=[crown] * 3, material="leaf"),
-    ]
-
-
-def stretch(rng, parts):
-    """Parts that stand on each other, in random proportions and moved a little."""
-    size = rng.uniform(0.7, 1.2, 3)
-    shift = np.append(rng.uniform(-0.06, 0.06, 2), 0)
-    foot = np.mean([part.centre for part in parts], axis=0)
-    foot[2] = parts[0].centre[2] - parts[0].half[2]
-    stretched = []
-    for part in parts:
-        grow = size if part.shape == "box" else size[[2, 2, 2]]  # others stay round
-        stretched.append(part._replace(
-            centre=foot + (part.centre - foot) * size + shift,
-            half=part.half * grow,
-            top=part.widths[1] * grow[0]))
-    return stretched
-
-
-def toy_landmark(number):
-    """The parts of a landmark; every number is another building."""
-    if number == 0:
-        return PLINTH + HALL + DOME + TOWER + ANNEX + STATUE
-    rng = np.random.default_rng([number, 1])
-    hall = stretch(rng, HALL + DOME)
-    dome = stretch(rng, hall[len(HALL):])  # once more
-    parts = PLINTH + hall[:len(HALL)] + dome
-    for group in (TOWER, ANNEX, STATUE):
-        parts += stretch(rng, group)
-    mirror = np.array([rng.choice((-1, 1)), 1, 1])
-    material = {"gold": "gold"}
-    for names in INTERCHANGEABLE:
-        material |= dict(zip(names, rng.permutation(names)))
-    return [
-        part._replace(centre=part.centre * mirror, material=material[part.material])
-        for part in parts
-    ]
-
-
-def part_sdf(part, x):
-    """Signed distance to a part, + and exact outside. (P,3) -> (P,)"""
-    x, y, z = (x - part.centre).T
-    if part.shape == "ground":
-        return z
-    if part.shape == "ball":
-        return np.hypot(np.hypot(x, y), z) - part.half[0]
-    # In the plane of u, outwards, and z: distance d to the slanted side, bottom and top.
-    u = abs(x) if part.shape == "box" else np.hypot(x, y)
-    bottom, top = part.widths
-    _, depth, half = part.half
-    slant = top - bottom
-    height = 2 * half
-    k = ((u - bottom) * slant + (z + half) * height) / (slant ** 2 + height ** 2)
-    k = np.clip(k, 0, 1)
-    side_u = u - bottom - k * slant
-    side_z = z + half - k * height
-    cap_u = np.maximum(u - np.where(z < 0, bottom, top), 0)
-    cap_z = abs(z) - half
-    is_inside = (side_u < 0) & (cap_z < 0)
-    d = np.minimum(np.hypot(side_u, side_z), np.hypot(cap_u, cap_z))
-    d = np.where(is_inside, -d, d)
-    if part.shape == "column":
-        return d
-    e = abs(y) - depth
-    outside = np.hypot(np.maximum(d, 0), np.maximum(e, 0))
-    return outside + np.minimum(np.maximum(d, e), 0)
-
-
-def gradient(sdf, x, step):
-    """Gradient of a distance function at x (P,3), by central differences. -> (P,3)"""
-    rise = [sdf(x + axis) - sdf(x - axis) for axis in step * np.eye(3)]
-    return np.stack(rise, axis=1) / (2 * step)
-
-
-def toy_sdf(x_world, background=True, landmark=0):
-    """Signed distance to the toy, + and exact outside, SfM units. (P,3) -> (P,)"""
-    x = (x_world - TOY_ORIGIN) / TOY_SCALE
-    parts = toy_landmark(landmark) + TOWN * background
-    distances = [part_sdf(part, x) for part in parts]
-    return np.min(distances, axis=0) * TOY_SCALE
-
-
-def intersect_part(part, o, d):
-    """Distances at which rays o, d (R,3) enter a part; inf for a miss. -> (R,)
-
-    A part is where a quadric and up to two slabs overlap. The quadric is round in the
-    first n coordinates, and its radius is linear in z: a roof has n = 1 and two slabs,
-    a cone n = 2 and one slab, a ball n = 3. A ray is inside between the last entrance
-    and the first exit.
-    """
-    o = o - part.centre
-    if part.shape == "ground":
-        return np.where(d[:, 2] < -1e-3, -o[:, 2] / d[:, 2], np.inf)
-    n = {"box": 1, "column": 2, "ball": 3}[part.shape]
-    bottom, top = part.widths
-    slope = (top - bottom) / part.half[2] / 2
-    rise = slope * d[:, 2]
-    radius = (bottom + top) / 2 + slope * o[:, 2]  # where the ray starts
-    a = (d[:, :n] ** 2).sum(1) - rise ** 2
-    b = (d[:, :n] * o[:, :n]).sum(1) - rise * radius
-    c = (o[:, :n] ** 2).sum(1) - radius * radius
-    root = np.sqrt(b * b - a * c)  # nan for a miss
-    enter = (-b - root) / a
-    leave = (-b + root) / a
-    is_steep = a < 0  # steeper than the cone: inside on one end, for ever
-    enter = np.where(is_steep & (rise < 0), -np.inf, enter)
-    leave = np.where(is_steep & (rise > 0), np.inf, leave)
-    for axis in range(n, 3):
-        middle = -o[:, axis] / d[:, axis]
-        reach = abs(part.half[axis] / d[:, axis])
-        enter = np.maximum(enter, middle - reach)
-        leave = np.minimum(leave, middle + reach)
-    return np.where((enter < leave) & (enter > 0), enter, np.inf)
-
-
-@np.errstate(divide="ignore", invalid="ignore")
-def trace(o, d, parts):
-    """First hits of rays from o (R,3) or (1,3) along d (R,3) or (1,3).
-
-    -> distance (R,), inf is sky, and number of the part (R,)
-    """
-    enter = np.stack([intersect_part(part, o, d) for part in parts])
-    return enter.min(0), enter.argmin(0)
-
-
-def sky_colour(d, weather):
-    """Linear colour of the sky and two ranges of hills. d (R,3), weather (4,) -> (R,3)"""
-    up = d[:, 2:]
-    azimuth = np.arctan2(d[:, :1], d[:, 1:2])
-    *tint, wind = weather
-    cloud = np.sin(5 * azimuth + 9 * wind) * np.sin(12 * up + 7 * wind)
-    colour = (0.58, 0.68, 0.78) - np.clip(up * 1.5, 0, 1) * (0.52, 0.46, 0.26)
-    colour = colour + 0.4 * np.array(tint) + 0.5 * abs(wind) * np.maximum(cloud, 0)
-    for height, amplitude, waves, hill in [
-        (0.11, 0.045, 5, (0.25, 0.33, 0.45)),
-        (0.06, 0.03, 9, (0.11, 0.18, 0.16)),
-    ]:
-        ridge = np.sin(waves * azimuth + height * 40)
-        ridge = ridge + 0.6 * np.sin(2.3 * waves * azimuth)
-        colour = np.where(up < height + amplitude * ridge, hill, colour)
-    return colour
-
-
-def texture(name, across, up):
-    """Colours of a material's cells at two coordinates (P,) on a surface. -> (P,3)"""
-    colour, (width, height), contrast, has_windows = MATERIALS[name]
-    row = up / height
-    column = across / width
-    if not has_windows:
-        column = column + np.floor(row) % 2 / 2  # every other row of stones is shifted
-    chance = np.sin(12.9898 * np.floor(column) + 78.233 * np.floor(row))
-    chance = abs(chance) * 437.585 % 1
-    brightness = 1 + contrast * (2 * chance - 1)
-    if has_windows:
-        is_window = (abs(column % 1 - 0.5) < 0.2) & (abs(row % 1 - 0.45) < 0.28)
-        brightness = brightness * (1 - 0.8 * is_window)
-    return colour * brightness[:, None]
-
-
-def surface_colour(part, x):
-    """Colours at points on a part's surface. (P,3) -> (P,3)"""
-    x, y, z = x.T
-    if part.shape == "ground":
-        is_paved = np.hypot(x, y)[:, None] < 2.6
-        return np.where(is_paved, texture("paving", x, y), texture("meadow", x, y))
-    across = x + y
-    if part.shape != "box":
-        across = np.arctan2(y - part.centre[1], x - part.centre[0])
-    return texture(part.material, across, z)
-
-
-def shade(o, d, parts, background, sun, weather):
-    """Linear colours along rays: sun, shadow, light of the sky, haze.
-
-    o (1,3), d (R,3), sun (3,), weather (4,) -> (R,3)
-    """
-    colour = sky_colour(d, weather) * background
-    t, which = trace(o, d, parts)
-    hit = np.flatnonzero(t < np.inf)
-    t = t[hit, None]
-    x = o + t * d[hit]
-    normal = np.zeros_like(x)
-    surface = np.zeros_like(x)
-    for i in np.unique(which[hit]):
-        part = parts[i]
-        own = which[hit] == i
-        normal[own] = gradient(lambda x: part_sdf(part, x), x[own], 1e-5)
-        surface[own] = surface_colour(part, x[own])
-    obstacle, _ = trace(x + 1e-4 * normal, sun[None], parts)
-    sunlight = np.maximum(normal @ sun, 0) * (obstacle == np.inf)
-    light = sunlight[:, None] * (1.15, 1.05, 0.88)
-    light += (0.20 + 0.10 * normal[:, 2:]) * (0.8, 0.92, 1.15)
-    clear = np.exp(-np.maximum(t - 5, 0) / 20)
-    colour[hit] = clear * surface * light + (1 - clear) * (0.42, 0.50, 0.58)
-    return colour
-
-
-def render(view, parts, background, sun, weather):
-    """Linear colours of a photo, the mean of four rays a pixel. -> (h*w,3) in 0..1"""
-    _, c2w, _, _ = view
-    samples = []
-    for offset in itertools.product((0.25, 0.75), repeat=2):  # places in a pixel
-        d = ray_directions(*view, offset)
-        colour = shade(c2w[None, :, 3], d, parts, background, sun, weather)
-        samples.append(np.clip(colour, 0, 1))
-    return np.mean(samples, axis=0)
-
-
-def toy_camera(rng, azimuth, size):
-    """A tourist's camera at `azimuth` [rad] from the front, in the toy's units.
-
-    -> K (4,), c2w (3,4), width, height
-    """
-    aspect = rng.choice([4 / 3, 3 / 2, 1.1, 3 / 4, 2 / 3])
-    w = round(size * min(1, aspect))
-    h = round(size * min(1, 1 / aspect))
-    angle = np.radians(rng.uniform(40, 65))  # of view, along the long side
-    f = size / 2 / np.tan(angle / 2)
-    target = (0, 0.05, 0.80) + rng.uniform(-0.12, 0.12, 3)
-    away = np.array([np.sin(azimuth), -np.cos(azimuth), rng.uniform(-0.15, 0.45)])
-    away = away * f / min(w, h) * rng.uniform(2.0, 2.6)
-    place = target + away * rng.choice((0.8, 1), p=(0.1, 0.9))
-    place[2] = max(place[2], 0.2)
-    z = target - place
-    z /= np.linalg.norm(z)
-    x = np.cross(z, (*rng.normal(0, 0.03, 2), 1))  # hardly anyone holds it level
-    x /= np.linalg.norm(x)
-    c2w = np.stack([x, np.cross(z, x), z, place], 1)
-    return (f, f, w / 2, h / 2), c2w, w, h
-
-
-# The strokes of a passer-by: from x y, to x y, width, in heights above the feet; colour.
-STROKES = [
-    ((-0.06, 0.03), (-0.06, 0.45), 0.10, "legs"),
-    ((0.06, 0.03), (0.06, 0.45), 0.10, "legs"),
-    ((-0.05, 0.50), (0.05, 0.50), 0.16, "coat"),
-    ((-0.05, 0.56), (0.05, 0.56), 0.16, "stripe"),
-    ((-0.05, 0.62), (0.05, 0.62), 0.16, "coat"),
-    ((-0.05, 0.68), (0.05, 0.68), 0.16, "stripe"),
-    ((-0.05, 0.74), (0.05, 0.74), 0.16, "coat"),
-    ((0, 0.92), (0, 0.92), 0.15, "skin"),
-]
-
-
-def draw_people(rng, w, h, share):
-    """Passers-by on about `share` of the photo. -> (h*w,4): colour x opacity, opacity"""
-    canvas = np.zeros((4 * h, 4 * w, 4), np.float32)  # drawn large, then averaged
-    left = share
-    while left > max(0.1 * share, 0.002):
-        height = np.sqrt(left * w * h / 0.25) * rng.uniform(0.5, 1)
-        height = 4 * np.clip(height, 0.12 * h, 0.95 * h)
-        feet = rng.uniform((0, 3.2 * h), (4 * w, 4 * h + 0.2 * height))
-        # Most colours are vivid, black or white.
-        coat, legs, thing, skin = 0.02 + 0.83 * rng.beta(0.4, 0.4, (4, 3))
-        skin = (0.3 + skin[:1]) * (0.8, 0.6, 0.45)
-        stripe = thing if rng.random() < 0.4 else coat
-        colours = dict(coat=coat, legs=legs, thing=thing, skin=skin, stripe=stripe)
-        begin = rng.uniform((-0.25, 0.5), (0.25, 1.15))  # of a bag, balloon or hat
-        end = begin + rng.uniform(-0.15, 0.15, 2)
-        strokes = [*STROKES, (begin, end, rng.uniform(0.08, 0.25), "thing")]
-        for begin, end, width, colour in strokes:
-            ends = feet + np.array([begin, end]) * (height, -height)
-            rgba = (*colours[colour].tolist(), 1)
-            cv2.line(canvas, *ends.astype(int), rgba, int(width * height) + 1)
-        left = share - canvas[..., 3].mean()
-    small = cv2.resize(canvas, (w, h), interpolation=cv2.INTER_AREA)
-    return small.reshape(-1, 4).astype(float)
-
-
-def develop(rng, linear, exposure):
-    """With a random exposure, white balance and contrast. linear (P,3) -> uint8 (P,3)"""
-    brightness, red, blue, contrast = exposure * rng.uniform(-1, 1, 4)
-    gain = 2 ** (brightness / 2) * np.array([1 + 0.1 * red, 1, 1 + 0.1 * blue])
-    srgb = np.clip(linear * gain, 0, 1) ** (1.2 ** contrast / 2.2)
-    return (srgb * 255 + 0.5).astype(np.uint8)
-
-
-def toy_points(rng, views, depth, surface, occluder):
-    """Points as by SfM, noisy and 1.5 % of them wrong, from lists with an item a photo.
-
-    views: K, c2w, width, height; depth (P,); surface (P,3); occluder (P,) bool
-    -> points (K,5) and tracks, as in build_scene
-    """
-    samples = []
-    count = 3000 // len(views)
-    for x, t, people in zip(surface, depth, occluder):
-        ok = (t < 30) & ~people
-        is_near = (abs(x - (0, 0, 1.02)) < (1.3, 1.3, 1)).all(1)  # the landmark
-        for some, n in [(ok & is_near, count), (ok & ~is_near, count // 5)]:
-            if some.any():
-                samples.append(x[rng.choice(np.flatnonzero(some), n)])
-    x = np.concatenate(samples)
-    tracks = []
-    for (K, c2w, *wh), t, people in zip(views, depth, occluder):
-        uv, distance = project(K, c2w, x)
-        pixel = pixel_index(uv, wh)
-        is_visible = abs(t[pixel] / distance - 1) < 0.02
-        is_visible &= is_in_photo(uv, wh) & ~people[pixel]
-        is_found = rng.random(len(x)) < 0.6
-        tracks.append(np.flatnonzero(is_visible & is_found))
-    is_wrong = rng.random((len(x), 1)) < 0.015
-    x += is_wrong * rng.uniform(-1, 1, x.shape)
-    x += rng.normal(0, 0.005, x.shape)
-    error = np.zeros(len(x))
-    sightings = np.bincount(np.concatenate(tracks), minlength=len(x))
-    return np.column_stack([x * TOY_SCALE + TOY_ORIGIN, error, sightings]), tracks
-
-
-def add_pose_noise(rng, K, c2w, pixels):
-    """Turns and moves c2w, in the toy's units, by `pixels` rms at the landmark."""
-    *turn, dx, dy = rng.normal(0, pixels / 2, 4) / K[0]  # [rad]: turned, and moved
-    c2w[:, 3] += c2w[:, :2] @ (dx, dy) * np.linalg.norm(c2w[:, 3])
-    c2w[:, :3] @= cv2.Rodrigues((*turn, 0))[0]
-
-
-def make_toy(seed=0, size=96, photos=48, test=8, occluders=0.05, exposure=1.0,
-             pose_noise=0.0, background=True, landmark=0, sun=0.0, sky=0.0):
-    """Scene of a procedural landmark, the same for every seed.
-
-    size: long side of a photo [px]
-    occluders: mean share of a training photo that people cover, 0 to 0.6
-    exposure: spread of brightness, white balance and contrast; 1 as of tourists, 0 to 2
-    pose_noise: of the training photos [px rms at the landmark]
-    background: False leaves nothing but the landmark, before black
-    landmark: another building for every number
-    sun: its azimuth differs from photo to photo by up to so many degrees
-    sky: how much its colour and clouds differ from photo to photo, 0 to 1
-    """
-    info = dict(locals(), scene="toy", kind="toy", downscale=1, folder=None, split=None)
-    is_sound = (
-        seed >= 0 and size >= 16 and photos >= 4 and test >= 0 and landmark >= 0
-        and 0 <= occluders <= 0.6 and 0 <= exposure <= 2 and 0 <= pose_noise < np.inf
-        and 0 <= sun <= 180 and 0 <= sky <= 1)
-    check(is_sound,
-          "occluders in 0..0.6, exposure 0..2, sun 0..180, sky 0..1, size >= 16, "
-          "photos >= 4, others >= 0")
-    generators = [np.random.default_rng([seed, k]) for k in range(7)]
-    # No knob changes another's random numbers.
-    camera_rng, exposure_rng, people_rng, sfm_rng, pose_rng, sun_rng, sky_rng = generators
-    count = photos + test
-    numbers = np.arange(count)
-    is_test = np.isin(numbers, (np.arange(test) + 0.5) * count // test)
-    azimuth = 200 * (numbers + camera_rng.uniform(0.1, 0.9, count)) / count - 100
-    share = people_rng.gamma(0.8 + 6 * occluders, size=count)  # some photos stay free
-    share = share * ~is_test
-    share = np.minimum(share / share.sum() * photos * occluders, 0.85)
-    turn = np.radians(sun_rng.uniform(-sun, sun, count))  # of the sun
-    weather = sky_rng.uniform(-sky, sky, (count, 4))
-    parts = toy_landmark(landmark) + TOWN * background
-    views, images, depth, surface, occluder = [], [], [], [], []  # of each photo
-    for i in progress(numbers, "drawing photos"):
-        view = toy_camera(camera_rng, np.radians(azimuth[i]), size)
-        _, c2w, w, h = view
-        to_sun = cv2.Rodrigues((0, 0, turn[i]))[0] @ SUN
-        linear = render(view, parts, background, to_sun, weather[i])
-        cover = draw_people(people_rng, w, h, share[i])
-        linear = linear * (1 - cover[:, 3:]) + cover[:, :3]
-        d = ray_directions(*view)
-        t, _ = trace(c2w[None, :, 3], d, parts)
-        views.append(view)
-        images.append(develop(exposure_rng, linear, exposure).reshape(h, w, 3))
-        depth.append(t)
-        surface.append(c2w[:, 3] + t[:, None] * d)
-        occluder.append(cover[:, 3] > 0)
-    points, tracks = toy_points(sfm_rng, views, depth, surface, occluder)
-    K, c2w, _, _ = zip(*views)
-    for i in numbers:
-        add_pose_noise(pose_rng, K[i], c2w[i], pose_noise * (not is_test[i]))
-        c2w[i][:, 3] = c2w[i][:, 3] * TOY_SCALE + TOY_ORIGIN
-    signs = np.array(list(itertools.product((-1, 1), repeat=3)))
-    corners = [part.centre + part.half * signs for part in toy_landmark(landmark)]
-    scene = build_scene(
-        images, K, c2w, is_test, [f"toy_{i:03d}.png" for i in numbers], points, tracks,
-        info, contain=np.array(corners) * TOY_SCALE + TOY_ORIGIN)
-    scene["depth"] = np.float16(np.concatenate(depth) * TOY_SCALE / scene["scale"])
-    scene["occluder"] = np.concatenate(occluder)
-    return scene | toy_walls(scene, np.concatenate(surface)[::9], background, landmark)
-
-
-def toy_walls(scene, surface, background, landmark):
-    """OPTIONAL arrays about surfaces, from visible points (P,3) in the toy's units."""
-    def sdf(x):  # (P,3) -> (P,), scene units
-        world = x * scene["scale"] + scene["center"]
-        return toy_sdf(world, background, landmark) / scene["scale"]
-
-    wall = (surface * TOY_SCALE + TOY_ORIGIN - scene["center"]) / scene["scale"]
-    wall = wall[lengths(wall) < 0.95]
-    normal = gradient(sdf, wall, 0.004)
-    is_smooth = abs(lengths(normal) - 1) < 0.01
-    near = wall + np.random.default_rng(0).normal(0, 0.02, wall.shape)
-    distance = sdf(near)
-    is_near = abs(distance) < 0.05
-    return dict(
-        wall=wall[is_smooth],
-        wall_normal=normal[is_smooth],
-        near_wall=near[is_near],
-        near_wall_sdf=distance[is_near])
-
-
 # ---- from photos, poses and points to a scene ------------------------------------------
 def find_sphere(x, weight, tracks, is_test, contain):
-    """Centre (3,) and radius of what most photos look at; its definition is [D7].
+    """Centre (3,) and radius of the scene sphere, which becomes the unit sphere [D7].
 
-    Centre: geometric median of points x (K,3) by weight. Radius: 1.1 x the distance of
+    Centre: geometric median of points x (P,3) by weight. Radius: 1.1 x the distance of
     95 %; if that is a skyline, more than four times the median distance away, only
     nearer points are counted. Inside are at least 30 % of the points (M,) of most
     training photos, and contain (...,3).
     """
-    centre = np.median(x, axis=0)
+    center = np.median(x, axis=0)
     for _ in range(20):  # Weiszfeld
-        w = weight / np.maximum(lengths(x - centre), 1e-9)
-        centre = w @ x / w.sum()
-    distance = lengths(x - centre)  # (K,)
+        w = weight / np.maximum(lengths(x - center), EPSILON)
+        center = w @ x / w.sum()
+    distance = lengths(x - center)  # (P,)
     counted = np.repeat(distance, weight)
     limit = 4 * np.median(counted)
     if np.quantile(counted, 0.95) > limit:
         counted = counted[counted <= limit]
+    # A distance in `counted`: between two of them there may be a gap.
     radius = 1.1 * np.quantile(counted, 0.95, method="inverted_cdf")
     reach = [
-        np.quantile(distance[own], 0.3)
-        for own, held_out in zip(tracks, is_test)
-        if len(own) and not held_out
+        np.quantile(distance[track], 0.3)
+        for track, held_out in zip(tracks, is_test)
+        if len(track) and not held_out
     ]
     check(reach,
           "no training photo observes a usable 3D point: they do not belong together")
-    corners = lengths(np.reshape(contain, (-1, 3)) - centre)
-    radius = max(radius, np.median(reach), *1.02 * corners)
-    check(radius > 1 / FAR, "all 3D points coincide: run SfM again")
-    return centre, radius
+    corners = 1.02 * lengths(np.reshape(contain, (-1, 3)) - center)  # a margin
+    radius = max(radius, np.median(reach), *corners)
+    check(radius > EPSILON, "all 3D points coincide: run SfM again")
+    return center, radius
 
 
 def build_scene(
         images, K, c2w, is_test, name, points, tracks, info, contain=(), masks=None):
     """The scene of images (h,w,3), each of which sees the points tracks (M,).
 
-    SfM units: c2w; points (K,5): x y z, error [px], views; contain (...,3).
+    SfM units: c2w; points (P,5): x y z, error [px], track length; contain (...,3).
     masks: of each photo (h,w) bool, True is left out.
     """
-    error, views = points[:, 3:].T
-    usable = views >= 3
+    error, track_length = points[:, 3:].T
+    usable = track_length >= 3
     if usable.sum() < 500:
-        usable = views >= 2
+        usable = track_length >= 2
     check(usable.sum() >= 20,
           f"{usable.sum()} usable 3D points: SfM needs more overlapping photos")
     usable &= error <= np.quantile(error[usable], 0.95)
     new_index = np.cumsum(usable) - 1
-    tracks = [new_index[own[usable[own]]] for own in tracks]
+    tracks = [new_index[track[usable[track]]] for track in tracks]  # drop unusable, renumber
     x = points[usable, :3]
-    weight = np.minimum(views[usable], 20).astype(int)
-    centre, radius = find_sphere(x, weight, tracks, is_test, contain)
+    weight = np.minimum(track_length[usable], 20).astype(int)
+    center, radius = find_sphere(x, weight, tracks, is_test, contain)
     c2w = np.array(c2w)
-    c2w[:, :, 3] = (c2w[:, :, 3] - centre) / radius
+    c2w[:, :, 3] = (c2w[:, :, 3] - center) / radius
     wh = np.array([image.shape[1::-1] for image in images])
     arrays = dict(
         rgb=np.concatenate([image.reshape(-1, 3) for image in images]),
@@ -783,10 +294,10 @@ def build_scene(
         c2w=c2w,
         is_test=is_test,
         name=name,
-        points=(x - centre) / radius,
-        track_photo=np.repeat(np.arange(len(wh)), [len(own) for own in tracks]),
+        points=(x - center) / radius,
+        track_photo=np.repeat(np.arange(len(wh)), [len(track) for track in tracks]),
         track_point=np.concatenate(tracks),
-        center=centre,
+        center=center,
         scale=radius,
         info=json.dumps(info))
     scene = {}
@@ -802,11 +313,11 @@ def brightness_spread(points, brightness):
     """Deviation of photos' brightness at equal points. Lists of (M,), an item a photo."""
     all_points = np.concatenate(points)
     mean = np.bincount(all_points, np.concatenate(brightness))
-    mean /= np.maximum(np.bincount(all_points), 1)  # (K,)
+    mean /= np.maximum(np.bincount(all_points), 1)  # (P,)
     offsets = []
-    for own, b in zip(points, brightness):
-        if len(own):
-            offsets.append(np.median(b - mean[own]))
+    for track, b in zip(points, brightness):
+        if len(track):
+            offsets.append(np.median(b - mean[track]))
     return np.std(offsets) if offsets else np.float64(0)
 
 
@@ -821,31 +332,42 @@ def common_color(colors):
 
 
 def add_statistics(scene):
-    """Adds the arrays of FORMAT that geonvs.py decides by.
+    """Adds near, track_uv, footprint, exposure_spread, bg_color.
 
-    near: 0.8 x the 2 % quantile of the distances of a photo's points, >= 0.02. Of the
-    training photos, without masked pixels: footprint, lower quartile of a pixel's size at
-    points in the sphere; exposure_spread, deviation of brightness at equal points;
-    bg_color, seen by rays that miss the sphere, NaN unless 60 % agree.
+    near: 0.8 x the 2 % quantile of the distances of a photo's points, >= 0.02.
+    """
+    near, track_uv = [], []
+    for i, (K, c2w, wh) in enumerate(zip(scene["K"], scene["c2w"], scene["wh"])):
+        track = scene["track_point"][scene["track_photo"] == i]
+        uv, distance = project(K, c2w, scene["points"][track])
+        track_uv.append(np.clip(uv / wh, -1, 2))
+        near.append(max(0.8 * np.quantile(distance, 0.02), 0.02) if len(track) else 0.05)
+    arrays = dict(
+        near=np.float32(near),
+        track_uv=np.concatenate(track_uv, dtype=np.float32))
+    return scene | arrays | training_statistics(scene)
+
+
+def training_statistics(scene):
+    """The numbers of FORMAT that come from the training photos, without masked pixels.
+
+    footprint: lower quartile of a pixel's size at points in the sphere.
+    exposure_spread: deviation of brightness at equal points.
+    bg_color: seen by rays that miss the sphere, NaN unless 60 % agree.
     """
     rgb = scene["rgb"]
     masked = scene.get("masked", np.zeros(len(rgb), bool))
     step = max(1, len(rgb) // 500_000)
-    near, track_uv = [], []  # of all photos
-    observed, sizes, brightness, background = [], [], [], []  # of the training photos
-    photos = zip(scene["start"], scene["K"], scene["c2w"], scene["wh"])
-    for i, (first, K, c2w, wh) in enumerate(photos):
-        own = scene["track_point"][scene["track_photo"] == i]
-        x = scene["points"][own]
+    observed, sizes, brightness, background = [], [], [], []
+    for i in np.flatnonzero(~scene["is_test"]):
+        first, K, c2w, wh = [scene[key][i] for key in ("start", "K", "c2w", "wh")]
+        track = scene["track_point"][scene["track_photo"] == i]
+        x = scene["points"][track]
         uv, distance = project(K, c2w, x)
-        track_uv.append(np.clip(uv / wh, -1, 2))
-        near.append(max(0.8 * np.quantile(distance, 0.02), 0.02) if len(own) else 0.05)
-        if scene["is_test"][i]:
-            continue
         sizes.append(distance[lengths(x) < 1] / K[0])
         pixel = first + pixel_index(uv, wh)
         is_seen = ~masked[pixel]
-        observed.append(own[is_seen])
+        observed.append(track[is_seen])
         brightness.append(rgb[pixel[is_seen]].mean(1) / 255)
         o = c2w[:, 3]
         d = ray_directions(K, c2w, *wh)
@@ -853,17 +375,13 @@ def add_statistics(scene):
         is_miss = lengths(closest) > 1
         is_miss &= ~masked[first:first + len(d)]
         background.append(rgb[first + np.flatnonzero(is_miss)[::step]])
-    return scene | dict(
-        near=np.float32(near),
-        track_uv=np.concatenate(track_uv, dtype=np.float32),
+    return dict(
         footprint=np.quantile(np.concatenate(sizes), 0.25),
         exposure_spread=brightness_spread(observed, brightness),
         bg_color=common_color(np.concatenate(background)))
 
 
-# ---- folders with photos, masks and COLMAP models --------------------------------------
-PHOTO_TYPES = (
-    ".jpg .jpeg .png .tif .tiff .bmp .webp .ppm .pgm .jp2 .avif .heic .heif".split())
+# ---- COLMAP models ---------------------------------------------------------------------
 # COLMAP's camera models in the order of their numbers, with their parameters.
 CAMERA_MODELS = dict(
     SIMPLE_PINHOLE="f cx cy",
@@ -935,11 +453,12 @@ def read_photos(sparse):
     (count,) = read("Q")
     for _ in range(count):
         _, *pose, camera = read("I7dI")
-        letters = iter(lambda: read("c")[0], b"\0")
+        letters = iter(lambda: read("c")[0], b"\0")  # the name ends with a zero byte
         name = b"".join(letters).decode(errors="surrogateescape")
         name = name.replace("\\", "/")  # of Windows
-        (sightings,) = read("Q")
-        ids = read(f"{3 * sightings}Q")[2::3]  # of u, v, point
+        (observations,) = read("Q")
+        # Records (u, v, point id), 8 bytes each; u and v are doubles and are skipped.
+        ids = read(f"{3 * observations}Q")[2::3]
         is_outside = any(step in ("", "..") for step in name.split("/"))
         check(name not in photos and not is_outside,
               f"{sparse}: photo {name!r} occurs twice or lies outside the image folder: "
@@ -954,7 +473,7 @@ def check_photo(camera, pose, is_test):
           "has no camera in the model, or a fisheye: run colmap image_undistorter")
     wh, K, distortion = camera
     numbers = np.concatenate([K, distortion, pose])
-    is_sound = (abs(numbers) < FAR).all() and min(K[:2]) > 1 / FAR and pose[:4].any()
+    is_sound = (abs(numbers) < MAX_NUMBER).all() and min(K[:2]) > EPSILON and pose[:4].any()
     check(is_sound and max(wh) < 32767, "has no sound camera or pose: run SfM again")
     angle = 2 * np.degrees(np.arctan(max(wh / K[:2]) / 2))
     check(is_test or 10 <= angle <= 120,
@@ -970,20 +489,26 @@ def camera_to_world(pose):
 
 
 def read_points(sparse):
-    """Points (K,5) of a COLMAP model, as in build_scene, and {id: row} of them."""
+    """Points (P,5) of a COLMAP model, as in build_scene, and {id: row} of them."""
     points, rows = [], {}
     read = open_binary(sparse / "points3D.bin")
     (count,) = read("Q")
     for _ in range(count):
-        key, x, y, z, *_, error, views = read("Q3d3BdQ")
-        read(f"{2 * views}I")  # the track: photos list their points
+        key, x, y, z, *_, error, track_length = read("Q3d3BdQ")
+        read(f"{2 * track_length}I")  # the track, skipped: photos list their points
         rows[key] = len(points)
-        points.append((x, y, z, error, views))
+        points.append((x, y, z, error, track_length))
     points = np.array(points, float).reshape(-1, 5)
-    points[~(abs(points) < FAR).all(1)] = 0  # nan as well: nobody sees them
+    # Zero track length: build_scene drops them. nan compares as False.
+    points[~(abs(points) < MAX_NUMBER).all(1)] = 0
     check((points[:, 4] > 1).any(),
           f"no point of {sparse} has a track: run colmap point_triangulator on it")
     return points, rows
+
+
+# ---- names and folders -----------------------------------------------------------------
+PHOTO_TYPES = (
+    ".jpg .jpeg .png .tif .tiff .bmp .webp .ppm .pgm .jp2 .avif .heic .heif".split())
 
 
 def files_below(folder, levels=7):
@@ -1033,7 +558,7 @@ def mask_files(images, names):
 
 
 def plain_name(name):
-    """The same for names that differ in case or Unicode form only."""
+    """A form that names share if they differ in case or Unicode form only."""
     folded = unicodedata.normalize("NFC", name).casefold()
     return unicodedata.normalize("NFC", folded)
 
@@ -1061,7 +586,7 @@ def name_hint(name, names):
 
 
 def open_model(folder, sparse):
-    """A model, with that folder around it in which most of its photos are."""
+    """Reads a COLMAP model and finds the folder that holds most of its photos."""
     photos = read_photos(sparse)
     places = []
     for place in (sparse, *sparse.parents):
@@ -1116,6 +641,7 @@ def find_model(folder, command):
     return best
 
 
+# ---- train/test split ------------------------------------------------------------------
 def read_table(path):
     """Lines of a table of any separator, as lists of words."""
     check(path.is_file(), f"the split file {path} is missing")
@@ -1191,8 +717,9 @@ def choose_held_out(folder, names, tables):
     return held_out
 
 
+# ---- checksums -------------------------------------------------------------------------
 def checksum(paths, start=0):
-    """Of the content of those files that exist."""
+    """CRC-32 over the content of the files that exist."""
     for path in paths:
         if path.is_file():
             start = zlib.crc32(path.read_bytes(), start)
@@ -1200,7 +727,7 @@ def checksum(paths, start=0):
 
 
 def photos_checksum(files, masks, start=0):
-    """Of the photos' names and content, and of their masks. files, masks: {name: path}"""
+    """CRC-32 over the photos' names and content and their masks. files, masks: {name: path}"""
     for name in sorted(files):
         start = zlib.crc32(os.fsencode(name), start)
         paths = [files[name]]
@@ -1211,7 +738,7 @@ def photos_checksum(files, masks, start=0):
 
 
 def fingerprint(info):
-    """Of the content of all files that a scene is read from, wherever they lie."""
+    """CRC-32 over the content of all files that a scene is read from, wherever they lie."""
     folder = Path(info["folder"])
     images = Path(info["images"])
     models = [
@@ -1227,15 +754,23 @@ def fingerprint(info):
     return photos_checksum(files, masks, start)
 
 
+def is_fresh(info):
+    """Whether a scene's sources are unchanged, or gone: a scene file needs none of them."""
+    if not Path(info["folder"]).is_dir():
+        return True
+    return "posed" in info and info["files"] == fingerprint(info)
+
+
+# ---- photos and masks ------------------------------------------------------------------
 def is_heic(path):
-    """Also under another extension, as phones and mail send it."""
+    """Whether a file is HEIC, by its content; phones often name it .jpg."""
     with open(path, "rb") as file:
         head = file.read(12)
     return head[4:8] == b"ftyp" and head[8:] in (b"heic", b"heix", b"mif1", b"msf1")
 
 
 def is_cut_off(data):
-    """Whether a JPEG or PNG file lacks its end. OpenCV does not tell."""
+    """Whether a JPEG or PNG file lacks its end, which OpenCV does not report."""
     if data[1:4] == b"PNG":
         return b"IEND" not in data
     last_scan = data.rfind(b"\xff\xda")
@@ -1244,7 +779,7 @@ def is_cut_off(data):
 
 
 def decode(data, flags):
-    """Image of OpenCV; None unless it is one."""
+    """The decoded image, or None."""
     try:
         return cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error:  # empty, or more than a gigapixel
@@ -1264,7 +799,7 @@ def undistort(image, camera):
 
 
 def read_photo(path, camera, downscale):
-    """As COLMAP has it, undistorted, then reduced. -> rgb uint8 (h,w,3), K (4,)"""
+    """Reads, undistorts and downscales a photo. -> rgb uint8 (h,w,3), K (4,)"""
     w, h = camera[0]
     check(1 <= downscale <= min(w, h) / 2, f"is {w} x {h}: choose another --downscale")
     check(path.is_file(), "is a broken link: copy the photo itself")
@@ -1289,7 +824,10 @@ def read_photo(path, camera, downscale):
 
 
 def read_mask(path, size):
-    """A mask in its photo's size (w, h). -> uint8 (h,w): 0 is left out, 255 is not"""
+    """Reads a mask and scales it to its photo's size (w, h).
+
+    -> uint8 (h,w): 0 is left out, 255 is not
+    """
     mask = decode(path.read_bytes(), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
     check(mask is not None, "is no image")
     mask = np.where(mask < 128, 0, 255).astype(np.uint8)
@@ -1301,7 +839,7 @@ def read_mask(path, size):
 
 
 def read_masks(model, usable):
-    """Of each usable photo, which pixels are left out: a list of (h,w) bool, or None."""
+    """The pixels that are left out of each usable photo: a list of (h,w) bool, or None."""
     paths = mask_files(model.images, usable)
     masks = []
     used = 0
@@ -1326,6 +864,7 @@ def read_masks(model, usable):
     return masks
 
 
+# ---- prepare ---------------------------------------------------------------------------
 def read_usable(model, points, rows, held_out, downscale):
     """{name: (rgb, K, c2w, rows of its points)} of the photos that can be used.
 
@@ -1344,12 +883,12 @@ def read_usable(model, points, rows, held_out, downscale):
             warn(f"left out: {name} {e}")
             continue
         c2w = camera_to_world(pose)
-        own = np.array([rows[key] for key in ids if key in rows], int)
-        uv, _ = project(K, c2w, points[own, :3])
+        track = np.array([rows[key] for key in ids if key in rows], int)
+        uv, _ = project(K, c2w, points[track, :3])
         is_inside = is_in_photo(uv, image.shape[1::-1])
-        if len(own) and is_inside.mean() < 0.5:
+        if len(track) and is_inside.mean() < 0.5:
             misfits[name] = is_inside.mean()
-        usable[name] = image, K, c2w, own
+        usable[name] = image, K, c2w, track
     check(2 * len(misfits) <= len(usable),
           f"{len(misfits)} of {len(usable)} photos miss most of their points: give poses as "
           "COLMAP does, world to camera, x right, y down, z forward, in the units of the points")
@@ -1435,11 +974,516 @@ def open_scene(name_or_folder, downscale=2):
     return scene
 
 
-def is_fresh(info):
-    """Whether a scene's sources are as they were, or gone: a scene file does without."""
-    if not Path(info["folder"]).is_dir():
-        return True
-    return "posed" in info and info["files"] == fingerprint(info)
+# ---- the toy: z up, front towards -y, in its own units ---------------------------------
+# Arbitrary: centre and scale of the scene must be recovered.
+TOY_SCALE = 3.7
+TOY_ORIGIN = np.array([12.0, -7.0, 5.0])
+
+
+def to_world(x):
+    """From the toy's units to those of the reconstruction. (...,3) -> (...,3)"""
+    return x * TOY_SCALE + TOY_ORIGIN
+
+
+def unit(x):
+    """The unit vector along x (3,)"""
+    return x / np.linalg.norm(x)
+
+
+SUN = unit(np.array([-0.50, -0.62, 0.60]))  # left, behind the tourists
+
+
+class Material(NamedTuple):
+    color: tuple
+    cell: tuple  # width and height of a stone, or of the wall around a window
+    contrast: float  # between cells
+    has_windows: bool = False
+
+
+MATERIALS = dict(
+    stone=Material((0.5, 0.46, 0.4), (0.29, 0.13), 0.2),
+    pale=Material((0.8, 0.74, 0.6), (0.29, 0.13), 0.08),
+    sand=Material((0.78, 0.56, 0.3), (0.3, 0.3), 0.15, has_windows=True),
+    brick=Material((0.52, 0.19, 0.11), (0.3, 0.3), 0.15, has_windows=True),
+    tiles=Material((0.6, 0.22, 0.12), (0.16, 0.08), 0.3),
+    slate=Material((0.12, 0.19, 0.31), (0.2, 0.1), 0.25),
+    copper=Material((0.16, 0.46, 0.36), (0.5, 0.5), 0.4),
+    gold=Material((0.9, 0.58, 0.08), (0.5, 0.5), 0),
+    plaster=Material((0.6, 0.46, 0.34), (0.62, 0.62), 0.15, has_windows=True),
+    leaf=Material((0.1, 0.22, 0.05), (0.2, 0.2), 0.45),
+    paving=Material((0.48, 0.42, 0.34), (0.42, 0.42), 0.2),
+    meadow=Material((0.17, 0.22, 0.08), (0.6, 0.6), 0.1),
+)
+# Other landmarks may swap materials within a group.
+INTERCHANGEABLE = [("stone", "pale"), ("sand", "brick"), ("tiles", "slate", "copper")]
+
+
+class Part(NamedTuple):
+    shape: str  # "ground", "ball", "column" (or cone), "box" (or roof)
+    center: tuple
+    half: tuple  # half width, depth and height; a ball's or column's radius
+    material: str
+    top: float = None  # half width at the top; None is the same as at the bottom
+
+    @property
+    def widths(self):
+        """Half width at the bottom and at the top."""
+        bottom = self.half[0]
+        return bottom, bottom if self.top is None else self.top
+
+
+PLINTH = [
+    Part("box", center=(-.01, -.03, .05), half=(.96, .53, .05), material="stone"),
+    Part("box", center=(-.05, 0, .15), half=(.85, .47, .05), material="stone"),
+]
+COLUMNS = [
+    Part("column", center=(x, -.34, .47), half=(.062, .062, .27), top=.05, material="pale")
+    for x in np.linspace(-.54, .60, 6)
+]
+HALL = COLUMNS + [
+    Part("box", center=(.03, .2, .53), half=(.59, .26, .33), material="sand"),
+    Part("box", center=(.03, .03, .8), half=(.67, .46, .06), material="pale"),
+    Part("box", center=(.03, .03, .98), half=(.71, .48, .12), top=0, material="tiles"),
+]
+DOME = [
+    Part("column", center=(-.05, .22, 1.07), half=(.33, .33, .17), top=.31, material="sand"),
+    Part("ball", center=(-.05, .22, 1.24), half=(.3, .3, .3), material="copper"),
+    Part("column", center=(-.05, .22, 1.57), half=(.075, .075, .07), top=.065, material="pale"),
+    Part("column", center=(-.05, .22, 1.7), half=(.1, .1, .06), top=.02, material="copper"),
+    Part("ball", center=(-.05, .22, 1.78), half=(.045, .045, .045), material="gold"),
+]
+TOWER = [
+    Part("box", center=(.87, .18, .53), half=(.17, .17, .53), material="brick"),
+    Part("box", center=(.87, .18, 1.1), half=(.2, .2, .04), material="pale"),
+    Part("column", center=(.87, .18, 1.32), half=(.2, .2, .18), top=0, material="slate"),
+]
+ANNEX = [
+    Part("box", center=(-.76, .24, .38), half=(.19, .25, .18), material="brick"),
+    Part("box", center=(-.76, .24, .65), half=(.23, .28, .09), top=0, material="slate"),
+]
+STATUE = [
+    Part("box", center=(-.8, -.35, .28), half=(.09, .09, .08), material="pale"),
+    Part("column", center=(-.8, -.35, .48), half=(.07, .07, .12), top=.04, material="copper"),
+    Part("ball", center=(-.8, -.35, .64), half=(.055, .055, .055), material="copper"),
+]
+# Houses around: x, y, half width, half height; a tree stands before each.
+HOUSES = [
+    (-7.5, 2, .6, .75), (-6.2, 4.4, .5, .55), (-4, 6.4, .8, .9), (-1.2, 7.6, .5, 1.15),
+    (2, 6.8, .7, .7), (4.6, 5.6, .5, .95), (6.8, 3, .6, .65), (7.4, 0, .5, .85),
+]
+TOWN = [Part("ground", center=(0, 0, 0), half=(1, 1, 1), material="paving")]
+for x, y, wide, tall in HOUSES:
+    crown = 0.8 * wide
+    TOWN += [
+        Part("box", center=(x, y, tall), half=(wide, wide, tall), material="plaster"),
+        Part("box", center=(x, y, 2 * tall + .25), half=(wide, wide, .25), top=0, material="slate"),
+        Part("ball", center=(.8 * x + 1, .7 * y, crown + .2), half=[crown] * 3, material="leaf"),
+    ]
+
+
+def stretch(rng, parts):
+    """Parts that stand on each other, in random proportions and moved a little."""
+    size = rng.uniform(0.7, 1.2, 3)
+    shift = np.append(rng.uniform(-0.06, 0.06, 2), 0)
+    foot = np.mean([part.center for part in parts], axis=0)
+    foot[2] = parts[0].center[2] - parts[0].half[2]
+
+    def stretched(part):
+        grow = size if part.shape == "box" else size[[2, 2, 2]]  # others stay round
+        return part._replace(
+            center=foot + (part.center - foot) * size + shift,
+            half=part.half * grow,
+            top=part.widths[1] * grow[0])
+    return [stretched(part) for part in parts]
+
+
+def toy_landmark(number):
+    """The parts of a landmark; every number is another building."""
+    if number == 0:
+        return PLINTH + HALL + DOME + TOWER + ANNEX + STATUE
+    rng = np.random.default_rng([number, 1])
+    hall = stretch(rng, HALL + DOME)
+    parts = PLINTH + hall[:len(HALL)]
+    for group in (hall[len(HALL):], TOWER, ANNEX, STATUE):  # the dome for the second time
+        parts += stretch(rng, group)
+    mirror = np.array([rng.choice((-1, 1)), 1, 1])
+    material = {"gold": "gold"}
+    for names in INTERCHANGEABLE:
+        material |= dict(zip(names, rng.permutation(names)))
+    return [
+        part._replace(center=part.center * mirror, material=material[part.material])
+        for part in parts
+    ]
+
+
+def toy_parts(landmark, background=True):
+    """The parts of a landmark, with the town around it unless the background is off."""
+    return toy_landmark(landmark) + (TOWN if background else [])
+
+
+def part_sdf(part, x):
+    """Signed distance to a part, + and exact outside. (P,3) -> (P,)"""
+    x, y, z = (x - part.center).T
+    if part.shape == "ground":
+        return z
+    if part.shape == "ball":
+        return np.hypot(np.hypot(x, y), z) - part.half[0]
+    # Distance d to the profile, a trapezoid in (u, z).
+    # u is the horizontal distance from the axis, for a box |x|.
+    u = abs(x) if part.shape == "box" else np.hypot(x, y)
+    bottom, top = part.widths
+    _, half_depth, half_height = part.half
+    slant = top - bottom
+    height = 2 * half_height
+    k = ((u - bottom) * slant + (z + half_height) * height) / (slant ** 2 + height ** 2)
+    k = np.clip(k, 0, 1)
+    side_u = u - bottom - k * slant
+    side_z = z + half_height - k * height
+    cap_u = np.maximum(u - np.where(z < 0, bottom, top), 0)
+    cap_z = abs(z) - half_height
+    is_inside = (side_u < 0) & (cap_z < 0)
+    d = np.minimum(np.hypot(side_u, side_z), np.hypot(cap_u, cap_z))
+    d = np.where(is_inside, -d, d)
+    if part.shape == "column":
+        return d
+    # A box extrudes the profile by +-half_depth along y.
+    e = abs(y) - half_depth
+    outside = np.hypot(np.maximum(d, 0), np.maximum(e, 0))
+    return outside + np.minimum(np.maximum(d, e), 0)
+
+
+def gradient(sdf, x, step):
+    """Gradient of a distance function at x (P,3), by central differences. -> (P,3)"""
+    rise = [sdf(x + axis) - sdf(x - axis) for axis in step * np.eye(3)]
+    return np.stack(rise, axis=1) / (2 * step)
+
+
+def toy_sdf(x_world, background=True, landmark=0):
+    """Signed distance to the toy, + and exact outside, SfM units. (P,3) -> (P,)"""
+    x = (x_world - TOY_ORIGIN) / TOY_SCALE
+    distances = [part_sdf(part, x) for part in toy_parts(landmark, background)]
+    return np.min(distances, axis=0) * TOY_SCALE
+
+
+@np.errstate(divide="ignore", invalid="ignore")  # rays that miss, or are parallel
+def intersect_part(part, o, d):
+    """Distances at which rays o, d (R,3) enter a part; inf for a miss. -> (R,)
+
+    A part is where a quadric and up to two slabs overlap. The quadric is round in the
+    first n coordinates, and its radius is linear in z: a roof has n = 1 and two slabs,
+    a cone n = 2 and one slab, a ball n = 3. A ray is inside between the last entrance
+    and the first exit.
+    """
+    o = o - part.center
+    if part.shape == "ground":
+        return np.where(d[:, 2] < -1e-3, -o[:, 2] / d[:, 2], np.inf)
+    n = {"box": 1, "column": 2, "ball": 3}[part.shape]
+    bottom, top = part.widths
+    slope = (top - bottom) / part.half[2] / 2
+    rise = slope * d[:, 2]
+    radius = (bottom + top) / 2 + slope * o[:, 2]  # where the ray starts
+    a = (d[:, :n] ** 2).sum(1) - rise ** 2
+    b = (d[:, :n] * o[:, :n]).sum(1) - rise * radius
+    c = (o[:, :n] ** 2).sum(1) - radius * radius
+    root = np.sqrt(b * b - a * c)  # nan for a miss
+    enter = (-b - root) / a
+    leave = (-b + root) / a
+    is_steep = a < 0  # steeper than the cone: inside on one end, for ever
+    enter = np.where(is_steep & (rise < 0), -np.inf, enter)
+    leave = np.where(is_steep & (rise > 0), np.inf, leave)
+    for axis in range(n, 3):
+        middle = -o[:, axis] / d[:, axis]
+        reach = abs(part.half[axis] / d[:, axis])
+        enter = np.maximum(enter, middle - reach)
+        leave = np.minimum(leave, middle + reach)
+    return np.where((enter < leave) & (enter > 0), enter, np.inf)
+
+
+def trace(o, d, parts):
+    """First hits of rays from o (R,3) or (1,3) along d (R,3) or (1,3).
+
+    -> distance (R,), inf is sky, and number of the part (R,)
+    """
+    enter = np.stack([intersect_part(part, o, d) for part in parts])
+    return enter.min(0), enter.argmin(0)
+
+
+def sky_color(d, weather):
+    """Linear colour of the sky and two ranges of hills. d (R,3) -> (R,3)
+
+    weather (4,): RGB tint and cloud phase, each in -sky..sky of make_toy.
+    """
+    up = d[:, 2:]
+    azimuth = np.arctan2(d[:, :1], d[:, 1:2])
+    *tint, phase = weather
+    cloud = np.sin(5 * azimuth + 9 * phase) * np.sin(12 * up + 7 * phase)
+    color = (0.58, 0.68, 0.78) - np.clip(up * 1.5, 0, 1) * (0.52, 0.46, 0.26)
+    color = color + 0.4 * np.array(tint) + 0.5 * abs(phase) * np.maximum(cloud, 0)
+    for height, amplitude, waves, hill in [
+        (0.11, 0.045, 5, (0.25, 0.33, 0.45)),
+        (0.06, 0.03, 9, (0.11, 0.18, 0.16)),
+    ]:
+        ridge = np.sin(waves * azimuth + height * 40)
+        ridge = ridge + 0.6 * np.sin(2.3 * waves * azimuth)
+        color = np.where(up < height + amplitude * ridge, hill, color)
+    return color
+
+
+def texture(name, across, up):
+    """Colours of a material's cells at two coordinates (P,) on a surface. -> (P,3)
+
+    across is an angle on round parts, up the height.
+    """
+    color, (width, height), contrast, has_windows = MATERIALS[name]
+    row = up / height
+    column = across / width
+    if not has_windows:
+        column = column + np.floor(row) % 2 / 2  # every other row of stones is shifted
+    # A random number per cell: the hash by a sine that shaders use.
+    chance = np.sin(12.9898 * np.floor(column) + 78.233 * np.floor(row))
+    chance = abs(chance) * 437.585 % 1
+    brightness = 1 + contrast * (2 * chance - 1)
+    if has_windows:
+        is_window = (abs(column % 1 - 0.5) < 0.2) & (abs(row % 1 - 0.45) < 0.28)
+        brightness = brightness * (1 - 0.8 * is_window)
+    return color * brightness[:, None]
+
+
+def surface_color(part, x):
+    """Colours at points on a part's surface. (P,3) -> (P,3)"""
+    x, y, z = x.T
+    if part.shape == "ground":
+        is_paved = np.hypot(x, y)[:, None] < 2.6
+        return np.where(is_paved, texture("paving", x, y), texture("meadow", x, y))
+    across = x + y
+    if part.shape != "box":
+        across = np.arctan2(y - part.center[1], x - part.center[0])  # the angle
+    return texture(part.material, across, z)
+
+
+def shade(o, d, parts, background, sun, weather):
+    """Linear colours along rays: sun, shadow, light of the sky, haze.
+
+    o (1,3), d (R,3), sun (3,), weather (4,) -> (R,3)
+    """
+    color = sky_color(d, weather) * background
+    t, which = trace(o, d, parts)
+    hit = np.flatnonzero(t < np.inf)
+    t, which = t[hit, None], which[hit]
+    x = o + t * d[hit]
+    normal, surface = np.zeros((2, *x.shape))
+    for i in np.unique(which):
+        part = parts[i]
+        here = which == i
+        normal[here] = gradient(lambda x: part_sdf(part, x), x[here], 1e-5)
+        surface[here] = surface_color(part, x[here])
+    obstacle, _ = trace(x + 1e-4 * normal, sun[None], parts)
+    sunlight = np.maximum(normal @ sun, 0) * (obstacle == np.inf)
+    light = sunlight[:, None] * (1.15, 1.05, 0.88)
+    light += (0.20 + 0.10 * normal[:, 2:]) * (0.8, 0.92, 1.15)
+    clear = np.exp(-np.maximum(t - 5, 0) / 20)
+    color[hit] = clear * surface * light + (1 - clear) * (0.42, 0.50, 0.58)
+    return color
+
+
+def render(camera, parts, background, sun, weather):
+    """Linear colours of a photo, the mean of four rays a pixel. -> (h*w,3) in 0..1"""
+    _, c2w, _, _ = camera
+    samples = []
+    for offset in itertools.product((0.25, 0.75), repeat=2):  # places in a pixel
+        d = ray_directions(*camera, offset)
+        color = shade(c2w[None, :, 3], d, parts, background, sun, weather)
+        samples.append(np.clip(color, 0, 1))
+    return np.mean(samples, axis=0)
+
+
+def toy_camera(rng, azimuth, size):
+    """A tourist's camera at `azimuth` [rad] from the front, in the toy's units.
+
+    -> K (4,), c2w (3,4), width, height
+    """
+    aspect = rng.choice([4 / 3, 3 / 2, 1.1, 3 / 4, 2 / 3])
+    w = round(size * min(1, aspect))
+    h = round(size * min(1, 1 / aspect))
+    angle = np.radians(rng.uniform(40, 65))  # of view, along the long side
+    f = size / 2 / np.tan(angle / 2)
+    target = (0, 0.05, 0.80) + rng.uniform(-0.12, 0.12, 3)
+    away = np.array([np.sin(azimuth), -np.cos(azimuth), rng.uniform(-0.15, 0.45)])
+    away = away * f / min(w, h) * rng.uniform(2.0, 2.6)
+    place = target + away * rng.choice((0.8, 1), p=(0.1, 0.9))  # one in ten stands closer
+    place[2] = max(place[2], 0.2)
+    z = unit(target - place)
+    x = unit(np.cross(z, (*rng.normal(0, 0.03, 2), 1)))  # hardly anyone holds it level
+    c2w = np.stack([x, np.cross(z, x), z, place], 1)
+    return (f, f, w / 2, h / 2), c2w, w, h
+
+
+# The strokes of a passer-by: from x y, to x y, width, in heights above the feet; colour.
+# Each covers part of those before it.
+STROKES = [
+    *[((x, 0.03), (x, 0.45), 0.10, "legs") for x in (-0.06, 0.06)],
+    *[((-0.05, y), (0.05, y), 0.16, name) for y, name in [
+        (0.50, "coat"), (0.56, "stripe"), (0.62, "coat"), (0.68, "stripe"), (0.74, "coat")]],
+    ((0, 0.92), (0, 0.92), 0.15, "skin"),
+]
+
+
+def draw_people(rng, w, h, share):
+    """Passers-by on about `share` of the photo. -> (h*w,4): colour x opacity, opacity"""
+    W, H = 4 * w, 4 * h  # drawn large, then averaged
+    canvas = np.zeros((H, W, 4), np.float32)
+    left = share
+    while left > max(0.1 * share, 0.002):
+        height = np.sqrt(left * W * H / 0.25) * rng.uniform(0.5, 1)
+        height = np.clip(height, 0.12 * H, 0.95 * H)
+        feet = rng.uniform((0, 0.8 * H), (W, H + 0.2 * height))
+        # Most colours are vivid, black or white.
+        coat, legs, thing, skin = 0.02 + 0.83 * rng.beta(0.4, 0.4, (4, 3))
+        skin = (0.3 + skin[:1]) * (0.8, 0.6, 0.45)
+        stripe = thing if rng.random() < 0.4 else coat
+        colors = dict(coat=coat, legs=legs, thing=thing, skin=skin, stripe=stripe)
+        hand = rng.uniform((-0.25, 0.5), (0.25, 1.15))  # holds a bag, balloon or hat
+        tip = hand + rng.uniform(-0.15, 0.15, 2)
+        strokes = [*STROKES, (hand, tip, rng.uniform(0.08, 0.25), "thing")]
+        for begin, end, width, color in strokes:
+            ends = feet + np.array([begin, end]) * (height, -height)
+            rgba = (*colors[color].tolist(), 1)
+            cv2.line(canvas, *ends.astype(int), rgba, int(width * height) + 1)
+        left = share - canvas[..., 3].mean()
+    small = cv2.resize(canvas, (w, h), interpolation=cv2.INTER_AREA)
+    return small.reshape(-1, 4).astype(float)
+
+
+def develop(rng, linear, exposure):
+    """Applies a random exposure, white balance and contrast. linear (P,3) -> uint8 (P,3)"""
+    brightness, red, blue, contrast = exposure * rng.uniform(-1, 1, 4)
+    gain = 2 ** (brightness / 2) * np.array([1 + 0.1 * red, 1, 1 + 0.1 * blue])
+    srgb = np.clip(linear * gain, 0, 1) ** (1.2 ** contrast / 2.2)
+    return (srgb * 255 + 0.5).astype(np.uint8)
+
+
+def toy_points(rng, cameras, depth, surface, occluder):
+    """Points as by SfM, noisy and 1.5 % of them wrong, from lists with an item a photo.
+
+    cameras: K, c2w, width, height; depth (h*w,); surface (h*w,3); occluder (h*w,) bool
+    -> points (P,5) and tracks, as in build_scene
+    """
+    samples = []
+    count = 3000 // len(cameras)
+    for x, t, people in zip(surface, depth, occluder):
+        ok = (t < 30) & ~people
+        is_near = (abs(x - (0, 0, 1.02)) < (1.3, 1.3, 1)).all(1)  # the landmark
+        for some, n in [(ok & is_near, count), (ok & ~is_near, count // 5)]:
+            if some.any():
+                samples.append(x[rng.choice(np.flatnonzero(some), n)])
+    x = np.concatenate(samples)
+    tracks = []
+    for (K, c2w, *wh), t, people in zip(cameras, depth, occluder):
+        uv, distance = project(K, c2w, x)
+        pixel = pixel_index(uv, wh)
+        is_visible = abs(t[pixel] / distance - 1) < 0.02
+        is_visible &= is_in_photo(uv, wh) & ~people[pixel]
+        is_found = rng.random(len(x)) < 0.6
+        tracks.append(np.flatnonzero(is_visible & is_found))
+    is_wrong = rng.random((len(x), 1)) < 0.015
+    x += is_wrong * rng.uniform(-1, 1, x.shape)
+    x += rng.normal(0, 0.005, x.shape)
+    error = np.zeros(len(x))
+    track_length = np.bincount(np.concatenate(tracks), minlength=len(x))
+    return np.column_stack([to_world(x), error, track_length]), tracks
+
+
+def add_pose_noise(rng, K, c2w, pixels):
+    """Turns and moves c2w, in the toy's units, by `pixels` rms at the landmark."""
+    # [rad]: rotation and shift in two axes each, so that 4 (pixels / 2)^2 = pixels^2.
+    *turn, dx, dy = rng.normal(0, pixels / 2, 4) / K[0]
+    c2w[:, 3] += c2w[:, :2] @ (dx, dy) * np.linalg.norm(c2w[:, 3])
+    c2w[:, :3] @= cv2.Rodrigues((*turn, 0))[0]
+
+
+def make_toy(seed=0, size=96, photos=48, test=8, occluders=0.05, exposure=1.0,
+             pose_noise=0.0, background=True, landmark=0, sun=0.0, sky=0.0):
+    """A synthetic scene.
+
+    `seed` changes cameras, people and noise; only `landmark` changes the building.
+
+    size: long side of a photo [px]
+    occluders: mean share of a training photo that people cover, 0 to 0.6
+    exposure: spread of brightness, white balance and contrast; 1 as of tourists, 0 to 2
+    pose_noise: of the training photos [px rms at the landmark]
+    background: False leaves nothing but the landmark, before black
+    landmark: another building for every number
+    sun: its azimuth differs from photo to photo by up to so many degrees
+    sky: how much its colour and clouds differ from photo to photo, 0 to 1
+    """
+    info = dict(locals(), scene="toy", kind="toy", downscale=1, folder=None, split=None)
+    is_sound = (
+        seed >= 0 and size >= 16 and photos >= 4 and test >= 0 and landmark >= 0
+        and 0 <= occluders <= 0.6 and 0 <= exposure <= 2 and 0 <= pose_noise < np.inf
+        and 0 <= sun <= 180 and 0 <= sky <= 1)
+    check(is_sound,
+          "occluders in 0..0.6, exposure 0..2, sun 0..180, sky 0..1, size >= 16, "
+          "photos >= 4, others >= 0")
+    # A generator per knob: no knob changes another's random numbers.
+    camera_rng, exposure_rng, people_rng, sfm_rng, pose_rng, sun_rng, sky_rng = [
+        np.random.default_rng([seed, k]) for k in range(7)]
+    count = photos + test
+    numbers = np.arange(count)
+    is_test = np.isin(numbers, (np.arange(test) + 0.5) * count // test)
+    azimuth = 200 * (numbers + camera_rng.uniform(0.1, 0.9, count)) / count - 100
+    share = people_rng.gamma(0.8 + 6 * occluders, size=count)  # some photos stay free
+    share = share * ~is_test
+    share = np.minimum(share / share.sum() * photos * occluders, 0.85)
+    turn = np.radians(sun_rng.uniform(-sun, sun, count))  # of the sun
+    weather = sky_rng.uniform(-sky, sky, (count, 4))
+    parts = toy_parts(landmark, background)
+    drawn = []
+    for i in progress(numbers, "drawing photos"):
+        camera = toy_camera(camera_rng, np.radians(azimuth[i]), size)
+        _, c2w, w, h = camera
+        to_sun = cv2.Rodrigues((0, 0, turn[i]))[0] @ SUN
+        linear = render(camera, parts, background, to_sun, weather[i])
+        people = draw_people(people_rng, w, h, share[i])
+        linear = linear * (1 - people[:, 3:]) + people[:, :3]
+        image = develop(exposure_rng, linear, exposure).reshape(h, w, 3)
+        d = ray_directions(*camera)
+        t, _ = trace(c2w[None, :, 3], d, parts)
+        drawn.append((camera, image, t, c2w[:, 3] + t[:, None] * d, people[:, 3] > 0))
+    cameras, images, depth, surface, occluder = zip(*drawn)
+    points, tracks = toy_points(sfm_rng, cameras, depth, surface, occluder)
+    K, c2w, _, _ = zip(*cameras)
+    for i in numbers:
+        add_pose_noise(pose_rng, K[i], c2w[i], pose_noise * (not is_test[i]))
+        c2w[i][:, 3] = to_world(c2w[i][:, 3])
+    signs = np.array(list(itertools.product((-1, 1), repeat=3)))
+    corners = [part.center + part.half * signs for part in toy_landmark(landmark)]
+    scene = build_scene(
+        images, K, c2w, is_test, [f"toy_{i:03d}.png" for i in numbers], points, tracks,
+        info, contain=to_world(np.array(corners)))
+    scene["depth"] = np.float16(np.concatenate(depth) * TOY_SCALE / scene["scale"])
+    scene["occluder"] = np.concatenate(occluder)
+    some = np.concatenate(surface)[::9]  # every ninth pixel; sky is infinite and drops out
+    return scene | surface_truth(scene, some, background, landmark)
+
+
+def surface_truth(scene, surface, background, landmark):
+    """OPTIONAL arrays about surfaces, from visible points (P,3) in the toy's units."""
+    def sdf(x):  # (P,3) -> (P,), scene units
+        world = x * scene["scale"] + scene["center"]
+        return toy_sdf(world, background, landmark) / scene["scale"]
+
+    wall = (to_world(surface) - scene["center"]) / scene["scale"]
+    wall = wall[lengths(wall) < 0.95]
+    normal = gradient(sdf, wall, 0.004)
+    is_smooth = abs(lengths(normal) - 1) < 0.01
+    near = wall + np.random.default_rng(0).normal(0, 0.02, wall.shape)
+    distance = sdf(near)
+    is_near = abs(distance) < 0.05
+    return dict(
+        wall=wall[is_smooth],
+        wall_normal=normal[is_smooth],
+        near_wall=near[is_near],
+        near_wall_sdf=distance[is_near])
 
 
 # ---- download, SfM, command line -------------------------------------------------------
@@ -1455,7 +1499,8 @@ def fetch(folder_url, path):
     try:
         path.parent.mkdir(exist_ok=True)
         with open(partial, "ab") as file:
-            have = max(file.tell() - 1, 0)  # the last byte again: also of a whole file
+            # Ask for the last byte again: past the end of a complete file a server answers 416.
+            have = max(file.tell() - 1, 0)
             request = Request(url, headers={"Range": f"bytes={have}-"})
             with urlopen(request, timeout=60) as answer:
                 if answer.status != 206:
@@ -1474,7 +1519,7 @@ def fetch(folder_url, path):
 
 
 def unpack(archive, wanted, folder):
-    """Files of a .tar.gz whose names start so; the whole archive is checked."""
+    """Unpacks the files whose names start with `wanted`; checks the whole .tar.gz."""
     with gzip.open(archive) as raw, tarfile.open(fileobj=raw, mode="r|") as tar:
         for member in tar:  # files only: a link could lead outside
             if member.isfile() and member.name.startswith(wanted):
@@ -1484,7 +1529,7 @@ def unpack(archive, wanted, folder):
 
 
 def download(name):
-    """Photos and reconstruction of one of SCENES, with its split file -> data/<name>/"""
+    """Downloads photos, reconstruction and split file of one of SCENES -> data/<name>/"""
     check(name in SCENES, f"--download knows {', '.join(SCENES)}, not {name}")
     inner, split = SCENES[name]
     folder = DATA / name
@@ -1523,7 +1568,7 @@ def sfm_photos(images):
 
 
 def write_sfm_masks(files, masks, folder):
-    """Masks in the photos' sizes under COLMAP's names, photo.jpg.png."""
+    """Writes masks in the photos' sizes under COLMAP's names, photo.jpg.png."""
     for name, path in masks.items():
         photo = decode(
             files[name].read_bytes(), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
@@ -1550,7 +1595,7 @@ def import_pycolmap():
 
 
 def run_sfm(folder):
-    """Poses for the raw photos in `folder`, by pycolmap -> folder/sparse/{0,1,...}
+    """Finds the poses of the raw photos in `folder` by pycolmap -> folder/sparse/{0,1,...}
 
     The database waits in data/ for a second try and goes after a success.
     """

@@ -52,17 +52,16 @@ if __name__ != "__main__":
 
 # ==== Part I: tests ===============================================================================
 
-TINY_TOY = dict(size=32, photos=6, test=2)
+TINY_TOY = dict(size=32, photos=6, test=2)  # photos: for training, in the scene
 TINY = dict(
     steps=6,
     rays=64,
-    photos=4,
+    photos=4,  # of a step
     samples=8,
     bg_samples=6,
     hidden=16,
     levels=3,
     appearance_dim=4)
-OCTANTS = F.pad(torch.ones(2, 2, 2).nonzero(), (1, 0))  # (8,4): level 0, then i, j, k
 
 
 def cases(names, **rows):
@@ -94,7 +93,7 @@ def double():
 
 
 @pytest.fixture
-def desk(tmp_path, monkeypatch):
+def in_tmp_dir(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
@@ -107,17 +106,17 @@ def random(*shape, low=0.0, high=1.0):
     return low + (high - low) * torch.rand(shape)
 
 
-def close(actual, wanted, tolerance=1e-5):
+def assert_tensors_close(actual, wanted, tolerance=1e-5):
     wanted = torch.as_tensor(wanted)
     torch.testing.assert_close(
         actual, wanted, rtol=tolerance, atol=tolerance, check_dtype=False)
 
 
-def assert_close(found, wanted, atol=1e-6):
+def assert_arrays_close(found, wanted, atol=1e-6):
     np.testing.assert_allclose(found, wanted, atol=atol, rtol=1e-5)
 
 
-def assert_same(a, b, *keys):
+def assert_same_arrays(a, b, *keys):
     for key in keys or a:
         np.testing.assert_equal(a[key], b[key], key)
 
@@ -140,7 +139,7 @@ def world(scene, x):
     return x * scene["scale"] + scene["center"]
 
 
-def run_main(command="place"):
+def run_main(command):
     """Exit code, stdout and stderr of data_prep's command line."""
     code = 0
     out, err = io.StringIO(), io.StringIO()
@@ -152,7 +151,7 @@ def run_main(command="place"):
     return code, out.getvalue(), err.getvalue()
 
 
-def assert_error(says, command="place"):
+def assert_error(says, command):
     code, out, err = run_main(command)
     assert code == 2
     assert says in err
@@ -191,7 +190,7 @@ def attempt(read, *args):
         assert "\n" not in str(e)
 
 
-def reread(data):
+def read_bytes_as_scene(data):
     """The scene of a file of these bytes, which can be used; None where it is refused."""
     path = Path("scene.npz")
     path.write_bytes(data)
@@ -201,30 +200,34 @@ def reread(data):
     return scene
 
 
-def refuses(changes):
+def is_refused(changes):
     """Whether a scene file with other arrays is refused."""
     good = {key: toy()[key] for key in data_prep.FORMAT}
-    return reread(zipped(good | changes)) is None
+    return read_bytes_as_scene(zipped(good | changes)) is None
 
 
-def test_damaged_scene_files_do_no_harm(desk):
+def test_damaged_scene_files_do_no_harm(in_tmp_dir):
+    """A changed byte is either harmless or refused with a one-line UserError.
+
+    There is no other exception.
+    """
     good = zipped(toy())
-    directory = good.find(b"PK\1\2")  # the end of the file
+    directory = good.find(b"PK\1\2")  # the zip directory, at the end
     for at in [*range(0, 300, 3), *range(directory, len(good), 25)]:
-        reread(good[:at] + b"9" + good[at + 1:])
+        read_bytes_as_scene(good[:at] + b"9" + good[at + 1:])
     for size in (0, 99, 9999, -99, -9):
-        assert reread(good[:size]) is None
-    assert reread(good)
+        assert read_bytes_as_scene(good[:size]) is None
+    assert read_bytes_as_scene(good)
 
 
 @pytest.mark.parametrize("key", data_prep.FORMAT | data_prep.OPTIONAL)
-def test_arrays_of_another_kind_are_refused(desk, key):
+def test_arrays_of_another_kind_are_refused(in_tmp_dir, key):
     good = toy() | dict(masked=np.zeros(len(toy()["rgb"]), bool))
-    assert refuses({key: good[key][None]})
-    assert refuses({key: good[key].astype("S9")})
+    assert is_refused({key: good[key][None]})
+    assert is_refused({key: good[key].astype("S9")})
     if key in data_prep.FORMAT:
         del good[key]
-        assert reread(zipped(good)) is None
+        assert read_bytes_as_scene(zipped(good)) is None
 
 
 def filled(value):
@@ -237,7 +240,7 @@ def filled(value):
     zero=("wh scale footprint", filled(0)),
     negative=("track_photo track_point", filled(-1)),
     mirrored=("wh", lambda wh: -wh),
-    no_such_photo=("track_photo", filled(8)),
+    no_such_photo=("track_photo", filled(8)),  # photos are 0..7
     no_such_point=("track_point", filled(10 ** 6)),
     nothing_to_train=("is_test", filled(True)),
     no_json=("info", filled("x")),
@@ -245,9 +248,9 @@ def filled(value):
     no_split=("info", filled('{"kind": 1, "scene": 1, "downscale": 1, "folder": 1}')),
     late_start=("start", lambda start: np.maximum(start, 1)),
     missing_pixel=("rgb", lambda rgb: rgb[1:]))
-def test_impossible_values_are_refused(desk, keys, change):
+def test_impossible_values_are_refused(in_tmp_dir, keys, change):
     for key in keys.split():
-        assert refuses({key: change(toy()[key])}), key
+        assert is_refused({key: change(toy()[key])}), key
 
 
 def peak(call, *args):
@@ -259,15 +262,19 @@ def peak(call, *args):
     return result, size
 
 
-def test_zip_bombs_are_refused_unread(desk):
+def test_zip_bombs_are_refused_unread(in_tmp_dir):
     big = np.zeros((2 ** 24, 3), np.uint8)
     bomb = zipped(toy() | dict(rgb=big), np.savez_compressed)
-    scene, size = peak(reread, bomb)
+    scene, size = peak(read_bytes_as_scene, bomb)
     assert scene is None
     assert size < 2 ** 22
-    end = b", 3), }"  # of a shape; spaces follow
-    promise = zipped(toy()).replace(end + b" " * 9, b"0" * 9 + end)
-    assert reread(promise) is None
+
+
+def test_headers_that_claim_too_much_are_refused(in_tmp_dir):
+    """A header that claims 10^9 times more rows than the file holds."""
+    end = b", 3), }"  # of a shape (rows, 3); spaces follow
+    claim = zipped(toy()).replace(end + b" " * 9, b"0" * 9 + end)
+    assert read_bytes_as_scene(claim) is None
 
 
 class Evil(str):
@@ -276,8 +283,8 @@ class Evil(str):
         return os.mkdir, (str(self),)
 
 
-def test_a_scene_file_never_runs_code(desk):
-    assert refuses(dict(name=np.array([Evil("harm")], object)))
+def test_a_scene_file_never_runs_code(in_tmp_dir):
+    assert is_refused(dict(name=np.array([Evil("harm")], object)))
     assert not Path("harm").exists()
 
 
@@ -290,164 +297,8 @@ def test_a_failed_write_leaves_the_old_file(tmp_path):
         raise OSError(28, "No space left")
     with pytest.raises(UserError, match="No space left"):
         data_prep.atomic_write(path, write)
-    with pytest.raises(UserError, match="encode"):  # as cv2.imwrite says no
-        data_prep.atomic_write(path, lambda part: False)
     assert path.read_text() == "old"
     assert os.listdir(path.parent) == ["scene.npz"]
-
-
-# ---- the toy -------------------------------------------------------------------------------------
-def scene_sdf(scene, x, **knobs):
-    """Signed distance of the toy at x (P,3), both in scene units -> (P,)"""
-    return data_prep.toy_sdf(world(scene, x), **knobs) / scene["scale"]
-
-
-@pytest.mark.parametrize("number", [1, 3, 10])
-def test_every_landmark_is_another_building(number):
-    parts = data_prep.toy_landmark(number)
-    first = data_prep.toy_landmark(0)
-    shift = [lengths(a.centre - np.array(b.centre)) for a, b in zip(parts, first)]
-    assert max(shift) > .1
-    assert [part.material for part in parts] != [part.material for part in first]
-    for part in parts:  # none hangs in the air
-        foot = np.array([part.centre]) - [0, 0, part.half[2]]
-        others = [other for other in parts + data_prep.TOWN if other is not part]
-        assert min(data_prep.part_sdf(other, foot)[0] for other in others) < .02
-
-
-@pytest.mark.parametrize("number", [0, 4])
-def test_a_landmark_fills_the_unit_sphere(number):
-    scene = toy(landmark=number)
-    x = np.random.default_rng(0).uniform(-1.5, 1.5, (60_000, 3))
-    distance = scene_sdf(scene, x, background=False, landmark=number)
-    reach = lengths(x[distance < 0]).max()
-    assert .75 < reach < 1
-
-
-@cases(
-    "shape, top, x, distance",
-    ground=("ground", 3, (1, 2, .5), .5),
-    corner=("box", 3, (5, 5, 7), 7),
-    inside=("box", 3, (1, 0, .5), -.5),
-    roof=("box", 1.5, (6.25, 0, 3), 5),
-    cone=("column", 1.5, (0, 6.25, 3), 5),
-    upper_edge=("column", 3, (4.2, 5.6, 4), 5),
-    ball=("ball", 3, (3, 4, 12), 10))
-def test_distances_to_parts_equal_closed_forms(shape, top, x, distance):
-    centre = np.array([10, 20, 30])
-    part = data_prep.Part(shape, centre, half=(3, 2, 1), material="gold", top=top)
-    assert_close(data_prep.part_sdf(part, np.array([centre + x])), distance)
-
-
-@cases("i, knobs", town=(4, {}), alone=(3, dict(background=False)), other=(2, dict(landmark=4)))
-def test_depth_is_where_the_distance_vanishes(i, knobs):
-    scene = toy(**knobs)
-    c2w = scene["c2w"][i]
-    d = data_prep.ray_directions(scene["K"][i], c2w, *scene["wh"][i])
-    t = np.zeros(len(d))
-    for _ in range(300):  # sphere tracing
-        x = c2w[:, 3] + t[:, None] * d
-        t += scene_sdf(scene, x, **knobs)
-    depth = photo(scene, i, "depth").ravel()
-    assert_close(np.minimum(t, 6), np.minimum(depth, 6), atol=.01)
-
-
-def test_rays_end_on_the_part_they_hit():
-    parts = data_prep.toy_landmark(0) + data_prep.TOWN
-    o = np.array([[0, -4.0, 1]])
-    d = np.random.default_rng(0).uniform(-1, 1, (999, 3))
-    t, which = data_prep.trace(o, d, parts)
-    x = o + np.minimum(t, 20)[:, None] * d
-    distance = [data_prep.part_sdf(parts[i], x[n:n + 1])[0] for n, i in enumerate(which)]
-    assert len(np.unique(which)) > 9
-    assert_close(np.array(distance)[t < 20], 0)
-
-
-def test_walls_agree_with_the_distance_function():
-    scene = toy()
-    before = scene["wall"] + .004 * scene["wall_normal"]
-    assert_close(np.median(scene_sdf(scene, before)), .004, atol=1e-4)
-    assert_close(scene_sdf(scene, scene["near_wall"]), scene["near_wall_sdf"])
-    assert np.abs(scene["near_wall_sdf"]).max() < .05
-
-
-def test_the_ground_behind_a_tower_is_darker():
-    parts = data_prep.toy_landmark(0) + data_prep.TOWN
-    o = np.array([[1.6, 1.1, 5], [.1, -.75, 5]])  # above the ground behind and before it
-    d = np.array([[1e-6, 1e-6, -1]] * 2)
-    behind, before = data_prep.shade(o, d, parts, True, data_prep.SUN, np.zeros(4)).mean(1)
-    assert behind < .6 * before
-
-
-def test_the_sun_turns_and_moves_nothing_else():
-    plain = toy(exposure=0.0)
-    other = toy(exposure=0.0, sun=90.0)
-    changed = np.abs(plain["rgb"].astype(float) - other["rgb"]).max(1) > 20
-    is_sky = np.isinf(plain["depth"])
-    assert_same(plain, other, "c2w", "points", "depth", "occluder", "track_point")
-    assert changed.mean() > .05
-    assert changed[is_sky].mean() < .1 * changed.mean()
-
-
-def test_photos_differ_in_exposure_by_the_knob():
-    plain, usual, extreme = [toy(exposure=knob)["exposure_spread"] for knob in (0.0, 1.0, 2.0)]
-    assert plain < .5 * usual
-    assert usual < .6 * extreme
-
-
-def test_people_cover_their_share_of_training_photos():
-    plain = toy(exposure=0.0, occluders=0.0, photos=16)
-    other = toy(exposure=0.0, occluders=.3, photos=16)
-    people = other["occluder"]
-    before = plain["rgb"].astype(float)
-    shares = np.array([photo(other, i, "occluder").mean() for i in range(18)])
-    training = shares[~other["is_test"]]
-    assert np.array_equal(before[~people], other["rgb"][~people])
-    assert (other["rgb"] > before + 50)[people].mean() > .05  # in colours
-    assert abs(training.mean() - .345) < .135
-    assert training.max() > 2 * training.min()
-    assert not shares[other["is_test"]].any()
-
-
-def test_points_lie_on_surfaces_in_plain_view():
-    scene = toy(size=48, photos=12, occluders=.3)
-    miss = np.abs(scene_sdf(scene, scene["points"].astype(float)))
-    assert len(miss) > 1000
-    assert abs(np.median(miss) - .0035) < .0025  # noise
-    assert .0005 < (miss > .03).mean() < .05  # outliers
-    seen_by = scene["track_photo"]
-    x = scene["points"][scene["track_point"]]
-    distance = lengths(x - scene["c2w"][seen_by, :, 3])
-    wh = scene["wh"][seen_by]
-    u, v = np.clip(scene["track_uv"] * wh, 0, wh - 1).astype(int).T
-    pixel = scene["start"][seen_by] + v * wh[:, 0] + u
-    is_behind = scene["depth"][pixel] < .8 * distance
-    is_hidden = is_behind | scene["occluder"][pixel]
-    assert np.bincount(scene["track_point"]).min() >= 2
-    assert is_hidden.mean() < .12
-
-
-def test_cameras_stand_upright_and_noise_moves_some():
-    clean = toy()
-    noisy = toy(pose_noise=3.0)
-    is_moved = (clean["c2w"] != noisy["c2w"]).any((1, 2))
-    down = noisy["c2w"][:, :, 1]
-    assert down[:, 2].max() < -.5
-    assert_same(clean, noisy, "rgb", "points", "center")
-    assert np.array_equal(is_moved, ~clean["is_test"])
-
-
-def test_pose_noise_is_in_pixels_rms():
-    rng = np.random.default_rng(0)
-    K = np.array([50, 50, 16, 16])
-    shift = []
-    for _ in range(500):
-        c2w = np.eye(3, 4)
-        c2w[2, 3] = -4  # looks at the landmark
-        data_prep.add_pose_noise(rng, K, c2w, 2.0)
-        uv, _ = data_prep.project(K, c2w, np.zeros((1, 3)))
-        shift.append(lengths(uv - 16))
-    assert abs(np.mean(np.square(shift)) - 4) < .4
 
 
 # ---- the sphere ----------------------------------------------------------------------------------
@@ -457,8 +308,9 @@ def ball(count):
     return x[lengths(x) < 1][:count]
 
 
-def sphere(xyz, views=20, tracks=None, is_test=(False, False, False), error=0, contain=(),
-           size=20, masks=None):
+def scene_of_points(
+        xyz, views=20, tracks=None, is_test=(False, False, False), error=0, contain=(),
+        size=20, masks=None):
     """The scene of three black photos that see these points: all of them, unless said."""
     if tracks is None:
         tracks = [np.arange(len(xyz))] * 3
@@ -472,23 +324,30 @@ def sphere(xyz, views=20, tracks=None, is_test=(False, False, False), error=0, c
 
 
 def with_skyline(count, distance):
+    """2000 points of the unit ball, and `count` at this distance."""
     x = ball(count)
     return np.concatenate([ball(2000), distance * x / lengths(x)[:, None]])
 
 
+# 1.1 x the radius that holds 95 % of a uniform ball.
+BALL_SCALE = 1.1 * .95 ** (1 / 3)
+
+
 @cases(
     "xyz, scale, tolerance, place",
-    ball=(ball(2000), 1.08, .03, 0),
-    larger_ball=(3 * ball(2000) + 5, 3.24, .09, 5),
-    near_skyline=(with_skyline(120, 10), 1.08, .1, 0),
-    skyline=(with_skyline(200, 30), 1.08, .1, 0),
-    long_skyline=(with_skyline(600, 20), 1.08, .1, 0),
-    distant_skyline=(with_skyline(20, 1e6), 1.08, .1, 0))
+    ball=(ball(2000), BALL_SCALE, .03, 0),
+    larger_ball=(3 * ball(2000) + 5, 3 * BALL_SCALE, .09, 5),
+    # More than 5 % of the points: the 95 % quantile is a skyline's, which is cut off.
+    near_skyline=(with_skyline(count=120, distance=10), BALL_SCALE, .1, 0),
+    skyline=(with_skyline(count=200, distance=30), BALL_SCALE, .1, 0),
+    long_skyline=(with_skyline(count=600, distance=20), BALL_SCALE, .1, 0),
+    # 1 %: the quantile is the ball's.
+    distant_skyline=(with_skyline(count=20, distance=1e6), BALL_SCALE, .1, 0))
 def test_the_sphere_holds_the_landmark(xyz, scale, tolerance, place):
-    scene = sphere(xyz)
+    scene = scene_of_points(xyz)
     assert abs(scene["scale"] - scale) < tolerance
     assert lengths(scene["center"] - place) < 1.6 * tolerance
-    assert_close(world(scene, scene["c2w"][:, :, 3]), 0)
+    assert_arrays_close(world(scene, scene["c2w"][:, :, 3]), 0)
 
 
 @cases(
@@ -496,25 +355,25 @@ def test_the_sphere_holds_the_landmark(xyz, scale, tolerance, place):
     most_see_far=("nff", (0, 0, 0), 30, 60),
     most_see_near=("nnf", (0, 0, 0), 1, 1.2),
     held_out_see_far=("nff", (0, 1, 1), 1, 1.2))
-def test_it_grows_until_photos_see_their_points(tracks, is_test, low, high):
+def test_sphere_grows_until_photos_see_their_points(tracks, is_test, low, high):
     xyz = np.concatenate([ball(2000), ball(300) + [40, 0, 0]])
     seen = dict(n=np.arange(100), f=np.arange(2000, 2150))  # near, far
-    scene = sphere(xyz, tracks=[seen[letter] for letter in tracks], is_test=is_test)
+    scene = scene_of_points(xyz, tracks=[seen[letter] for letter in tracks], is_test=is_test)
     assert low < scene["scale"] < high
 
 
-def test_the_sphere_holds_what_it_must():
-    scene = sphere(ball(500))
-    larger = sphere(ball(500), contain=scene["center"] + [[0, 3, 4], [1, 0, 0]])
-    assert_close(larger["scale"], 5.1)
+def test_sphere_contains_given_corners():
+    scene = scene_of_points(ball(500))
+    larger = scene_of_points(ball(500), contain=scene["center"] + [[0, 3, 4], [1, 0, 0]])
+    assert_arrays_close(larger["scale"], 5.1)  # 1.02 x |(0, 3, 4)|
 
 
 def test_points_count_by_views_up_to_twenty():
     xyz = np.concatenate([ball(2000), ball(1500) + [3, 0, 0]])
     is_second = xyz[:, 0] > 1.5
-    rare = sphere(xyz, np.where(is_second, 3, 20))
-    often = sphere(xyz, np.where(is_second, 20, 900))
-    equal = sphere(xyz)
+    rare = scene_of_points(xyz, np.where(is_second, 3, 20))
+    often = scene_of_points(xyz, np.where(is_second, 20, 900))
+    equal = scene_of_points(xyz)
     assert rare["center"][0] < .5 * equal["center"][0]
     assert np.array_equal(often["center"], equal["center"])
 
@@ -522,14 +381,14 @@ def test_points_count_by_views_up_to_twenty():
 @pytest.mark.parametrize("count, kept", [(500, 500), (499, 2249)])
 def test_two_views_suffice_where_points_are_few(count, kept):
     views = np.where(np.arange(2249) < count, 3, 2)
-    assert len(sphere(ball(2249), views)["points"]) == kept
+    assert len(scene_of_points(ball(2249), views)["points"]) == kept
 
 
 def test_points_with_the_largest_errors_are_dropped():
     views = np.where(np.arange(2000) < 600, 3, 2)
-    scene = sphere(ball(2000), views, error=np.arange(2000))
+    scene = scene_of_points(ball(2000), views, error=np.arange(2000))
     points = world(scene, scene["points"].astype(float))
-    assert_close(points, ball(2000)[:570], atol=1e-4)
+    assert_arrays_close(points, ball(2000)[:570], atol=1e-4)
 
 
 @cases(
@@ -539,32 +398,32 @@ def test_points_with_the_largest_errors_are_dropped():
     held_out=(ball(30), True, "no training photo"))
 def test_points_without_a_sphere_are_an_error(xyz, held_out, says):
     with pytest.raises(UserError, match=says):
-        sphere(xyz, is_test=[held_out] * 3)
+        scene_of_points(xyz, is_test=[held_out] * 3)
 
 
 def test_near_follows_the_nearest_points():
     xyz = ball(900) + [0, 0, 3]
     xyz[0] = 0  # where the cameras are
-    scene = sphere(xyz, tracks=[np.arange(1, 900), np.arange(1), np.arange(0)])
+    scene = scene_of_points(xyz, tracks=[np.arange(1, 900), np.arange(1), np.arange(0)])
     nearest = np.quantile(lengths(xyz[1:]), .02) / scene["scale"]
-    assert_close(scene["near"], [.8 * nearest, .02, .05])
+    assert_arrays_close(scene["near"], [.8 * nearest, .02, .05])
 
 
 def test_footprint_is_a_pixels_size_on_the_landmark():
     xyz = ball(900)
     xyz[:100] *= 9  # most of these lie outside
     xyz += [0, 0, 9]
-    scene = sphere(xyz)
+    scene = scene_of_points(xyz)
     distance = lengths(xyz)[lengths(scene["points"]) < 1] / scene["scale"]
-    assert_close(scene["footprint"], np.quantile(distance, .25) / 20)
+    assert_arrays_close(scene["footprint"], np.quantile(distance, .25) / 20)
 
 
 def test_sightings_are_clipped_around_the_photo():
     xyz = ball(900)  # the camera is amid them
     u = xyz[:, 0] / xyz[:, 2] + 1
     wanted = np.where(xyz[:, 2] > 0, u.clip(-1, 2), -1)
-    found = sphere(xyz)["track_uv"][:900, 0]
-    assert_close(found, wanted, atol=1e-3)
+    found = scene_of_points(xyz)["track_uv"][:900, 0]
+    assert_arrays_close(found, wanted, atol=1e-3)
 
 
 @cases(
@@ -576,24 +435,24 @@ def test_sightings_are_clipped_around_the_photo():
 def test_background_is_what_sixty_percent_agree_on(size, black, masked, color):
     masks = np.zeros((3, size * size), bool)
     masks[0, black:black + masked] = True
-    scene = sphere(  # all rays miss the sphere
+    scene = scene_of_points(  # all rays miss the sphere
         ball(500) + [9, 9, 9], is_test=[False, True, True], size=size, masks=list(masks))
     noise = np.random.default_rng(0).integers(9, 255, (3 * size * size, 3))
     scene["rgb"][black:] = noise[black:]
-    assert_close(data_prep.add_statistics(scene)["bg_color"], [color] * 3)
+    assert_arrays_close(data_prep.add_statistics(scene)["bg_color"], [color] * 3)
 
 
 def test_background_is_beyond_the_landmark():
-    assert_close(toy(background=False)["bg_color"], [0, 0, 0])  # the landmark is not black
+    assert_arrays_close(toy(background=False)["bg_color"], [0, 0, 0])  # the landmark is not black
 
 
 @cases("masked, spread", none=(False, 25 / 255), second_photo=(True, 0))
 def test_exposure_spread_is_of_training_photos(masked, spread):
     masks = [np.full(400, i == 1 and masked) for i in range(3)]
-    scene = sphere(ball(500), is_test=[False, False, True], masks=masks)
+    scene = scene_of_points(ball(500), is_test=[False, False, True], masks=masks)
     scene["rgb"][400:800] = 50
     scene["rgb"][800:] = 255
-    assert_close(data_prep.add_statistics(scene)["exposure_spread"], spread)
+    assert_arrays_close(data_prep.add_statistics(scene)["exposure_spread"], spread)
 
 
 # ---- COLMAP folders ------------------------------------------------------------------------------
@@ -680,7 +539,7 @@ def write_folder(scene, images="dense/images", sparse="dense/sparse", folder="pl
 
 
 @pytest.fixture
-def model(desk, source):
+def model(in_tmp_dir, source):
     return write_folder(source)
 
 
@@ -691,7 +550,7 @@ def model(desk, source):
     ("images", "."),
     ("input", "distorted/sparse/0"),
     (".", "sparse")])
-def test_a_scene_survives_colmap_files(desk, source, images, sparse):
+def test_a_scene_survives_colmap_files(in_tmp_dir, source, images, sparse):
     write_folder(source, images, sparse)
     code, out, err = run_main("place --downscale 1")
     scene = data_prep.open_scene("place", 1)
@@ -699,11 +558,11 @@ def test_a_scene_survives_colmap_files(desk, source, images, sparse):
     assert not err
     assert f"radius of {scene['scale']:.3g} units" in out
     assert f"{share:.0%} of the points are inside" in out
-    assert_same(scene, source, "rgb", "is_test", "name", "wh", "track_photo", "track_point")
-    assert_close(scene["K"], source["K"])
-    assert_close(scene["c2w"][..., :3], source["c2w"][..., :3])
-    assert_close(world(scene, scene["c2w"][..., 3]), world(source, source["c2w"][..., 3]))
-    assert_close(world(scene, scene["points"]), world(source, source["points"]), atol=1e-4)
+    assert_same_arrays(scene, source, "rgb", "is_test", "name", "wh", "track_photo", "track_point")
+    assert_arrays_close(scene["K"], source["K"])
+    assert_arrays_close(scene["c2w"][..., :3], source["c2w"][..., :3])
+    assert_arrays_close(world(scene, scene["c2w"][..., 3]), world(source, source["c2w"][..., 3]))
+    assert_arrays_close(world(scene, scene["points"]), world(source, source["points"]), atol=1e-4)
 
 
 def test_the_cameras_of_photos_shrink_with_them(model, source):
@@ -712,8 +571,8 @@ def test_the_cameras_of_photos_shrink_with_them(model, source):
     small = data_prep.prepare("place", 3)
     share = source["wh"] // 3 / source["wh"]
     assert np.array_equal(small["wh"], source["wh"] // 3)
-    assert_close(small["K"], source["K"] * np.tile(share, 2))
-    assert_close(photo(data_prep.prepare("place"), 0), 127)  # photos shrink as a mean
+    assert_arrays_close(small["K"], source["K"] * np.tile(share, 2))
+    assert_arrays_close(photo(data_prep.prepare("place"), 0), 127)  # photos shrink as a mean
 
 
 @cases(
@@ -764,7 +623,7 @@ def test_absurd_points_do_no_harm(model, far):
     write_model(model)
     with np.errstate(all="raise"):
         scene = data_prep.prepare("place")
-    assert_same(scene, clean, "points", "track_point", "c2w", "near", "scale")
+    assert_same_arrays(scene, clean, "points", "track_point", "c2w", "near", "scale")
 
 
 def change(column, rows, value):
@@ -828,11 +687,11 @@ def smaller_units(model):
     half_a_split=(half_a_split, "test_list.txt is missing"))
 def test_a_bad_folder_is_refused(model, spoil, says):
     spoil(model)
-    assert_error(says)
+    assert_error(says, "place")
 
 
-def test_the_folder_around_images_is_named(model, desk):
-    says = f"images has no COLMAP model, the folder around it has: give {desk}/place/dense"
+def test_the_folder_around_images_is_named(model, in_tmp_dir):
+    says = f"images has no COLMAP model, the folder around it has: give {in_tmp_dir}/place/dense"
     assert_error(says, "place/dense/images")
 
 
@@ -887,7 +746,7 @@ def fold(model):
     dangling=(dangle, "is a broken link"))
 def test_a_bad_photo_is_left_out_and_named(model, spoil, says):
     spoil(model)
-    code, out, err = run_main()
+    code, out, err = run_main("place")
     assert "9 photos, 2 of them for testing" in out
     assert err.startswith("left out: toy_000.png ")
     assert says in err
@@ -896,7 +755,7 @@ def test_a_bad_photo_is_left_out_and_named(model, spoil, says):
 
 def test_bad_photos_are_found_in_one_go(model):
     change("poses", [0, 4, 7], np.nan)(model)
-    code, out, err = run_main()
+    code, out, err = run_main("place")
     assert code == 2
     assert re.findall("left out: (.*).png has", err) == ["toy_000", "toy_004", "toy_007"]
     assert err.endswith("repair them or hold out others: ['toy_007.png']\n")
@@ -920,7 +779,7 @@ def test_the_largest_model_is_taken(model):
     write_model(model, Path("place/dense/sparse/1"))
     shutil.copy(PHOTO, IMAGES / "more.JPG")
     Path(IMAGES, "toy_003.png").rename(IMAGES / "toy_003.jpeg")
-    code, out, err = run_main()
+    code, out, err = run_main("place")
     assert "11 photos on disk, 9 posed by place/dense/sparse\n" in out
     assert "4 posed by place/dense/sparse/1" in out
     assert "1 photos of place/dense/sparse are not on disk, such as 'toy_003.png'; there is " in err
@@ -930,7 +789,7 @@ def test_the_largest_model_is_taken(model):
 def test_of_equal_models_a_usable_one_is_taken(model):
     model.cameras[:] = 99
     write_model(model, Path("place/dense/models"))
-    code, out, err = run_main()
+    code, out, err = run_main("place")
     assert "10 posed by place/dense/sparse\n" in out
     assert "left out" not in out + err
 
@@ -941,16 +800,16 @@ def test_of_equal_models_a_usable_one_is_taken(model):
     of_windows=("a b\\{}.png", "a b/{}.png"),
     of_a_mac=("é{}.png", "e\u0301{}.PNG"),  # composed and decomposed
     no_utf8=("\udcff{}.png", "\udcff{}.png"))
-def test_photos_are_found_by_alike_names(desk, source, names, on_disk):
+def test_photos_are_found_by_alike_names(in_tmp_dir, source, names, on_disk):
     model = write_folder(source | dict(name=np.array([on_disk.format(i) for i in range(10)])))
     model.names = [names.format(i) for i in range(10)]
     write_model(model)
     IMAGES.rename("elsewhere")
-    IMAGES.symlink_to(desk / "elsewhere")
+    IMAGES.symlink_to(in_tmp_dir / "elsewhere")
     assert run_main("place --downscale 1")[0] == 0
     scene = data_prep.open_scene("place", 1)
     assert scene["name"].tolist() == [name.replace("\\", "/") for name in model.names]
-    assert_same(scene, source, "rgb", "track_point", "is_test")
+    assert_same_arrays(scene, source, "rgb", "track_point", "is_test")
 
 
 @cases(
@@ -965,52 +824,36 @@ def test_equal_names_go_before_alike_ones(wanted, there, found):
     assert data_prep.match_names(wanted.split(), there.split()) == found
 
 
-def test_thumbnails_and_masks_are_no_photos(desk, source):
+def test_thumbnails_and_masks_are_no_photos(in_tmp_dir, source):
     write_folder(source, "images", "sparse")
     for folder in ("@eaDir", ".thumbnails", "masks", "dense"):
         Path("place/images", folder).mkdir()
         shutil.copy("place/images/toy_000.png", Path("place/images", folder, "x.png"))
-    assert "place/images: 10 photos on disk, 10 posed" in run_main()[1]
+    assert "place/images: 10 photos on disk, 10 posed" in run_main("place")[1]
 
 
-# ---- masks ---------------------------------------------------------------------------------------
-BLACK_LEFT = np.uint8([[0, 255]] * 2)
+# ---- damaged models ------------------------------------------------------------------------------
+@pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin"])
+def test_a_damaged_model_is_refused_in_little_memory(tmp_path, source, name):
+    model = colmap_model(source)
+    model.names = model.names[:2]
+    model.x = model.x[:3]
+    model.views[:3] = 2
+    model.sightings = np.zeros((2, 1), int)
+    write_model(model, tmp_path)
+    path = tmp_path / name
+    good = path.read_bytes()
 
-
-@pytest.mark.parametrize("folder", [IMAGES / "masks", MASKS], ids=["within", "beside"])
-@pytest.mark.parametrize("name, mask_name", [
-    ("toy_000.png", "toy_000.png"),
-    ("toy_000.jpg", "toy_000.png"),
-    ("toy_000.jpg", "toy_000.jpg.png"),
-    ("toy_000.jpg", "toy_000.jpg")])
-def test_black_pixels_of_masks_are_left_out(model, source, folder, name, mask_name):
-    change("names", 0, name)(model)
-    PHOTO.rename(IMAGES / name)
-    TABLE.unlink()
-    w, h = source["wh"][0]
-    mask = cv2.resize(BLACK_LEFT, (2 * w, 2 * h), interpolation=cv2.INTER_NEAREST)
-    put(folder / mask_name, encoded(mask, Path(mask_name).suffix))
-    code, out, err = run_main("place --downscale 1")
-    scene = data_prep.open_scene("place", 1)
-    masked = photo(scene, 0, "masked")
-    share = scene["masked"].mean()
-    assert f"1 of 10 photos have a mask: {share:.0%} of all pixels are black" in out
-    assert masked[:, :w // 2].all()
-    assert masked.sum() == scene["masked"].sum() == h * (w // 2)
-
-
-@cases(
-    "name, mask, says",
-    black=("toy_000.png", BLACK, "is black all over"),
-    nearly_black=("toy_000.png", BLACK + 1, "is black all over"),
-    turned=("toy_000.png", BLACK.T + 255, "has 27 x 40 pixels, its photo 40 x 27"),
-    of_no_photo=("other.png", BLACK + 255, "no name in it, such as other.png, is a photo's"))
-def test_a_mask_that_cannot_be_used_is_named(model, name, mask, says):
-    put(MASKS / name, encoded(mask))
-    code, out, err = run_main()
-    assert code == 0
-    assert says in err
-    assert "masked" not in data_prep.open_scene("place")
+    def read(data):
+        path.write_bytes(data)
+        return data_prep.read_photos(tmp_path), data_prep.read_points(tmp_path)
+    assert attempt(read, good)
+    for size in range(0, len(good), 3):
+        assert attempt(read, good[:size]) is None
+    for at in range(len(good) - 7):
+        for number in (2 ** 40, 2 ** 64 - 1):  # also as a count
+            _, size = peak(attempt, read, good[:at] + pack("Q", number) + good[at + 8:])
+            assert size < 2 ** 21
 
 
 # ---- split tables --------------------------------------------------------------------------------
@@ -1074,7 +917,7 @@ def test_a_folders_split_is_used_and_named(model, files, flag, name, rule):
 def test_names_nearby_are_told(model):
     text = TABLE.read_text().replace("toy_000.png", "images/toy_000.jpg")
     put(TABLE, text + "\ntrain\tghost")
-    code, out, err = run_main()
+    code, out, err = run_main("place")
     assert "left out: images/toy_000.jpg has no pose; there is 'toy_000.png'\n" in err
     assert "left out: ghost has no pose\n" in err
 
@@ -1141,23 +984,23 @@ def test_a_split_named_once_stays(model):
         data_prep.open_scene("place")
 
 
-def test_every_folder_has_its_own_file(desk):
-    names = ["toy", "sacre", "one/photos", "two/photos", "./toy", desk / "sacre"]
+def test_every_folder_has_its_own_file(in_tmp_dir):
+    names = ["toy", "sacre", "one/photos", "two/photos", "./toy", in_tmp_dir / "sacre"]
     paths = [data_prep.scene_path(name) for name in names]
     assert len(set(paths)) == 6
     assert data_prep.scene_path("a/../b") == data_prep.scene_path("b")
 
 
-def test_a_toy_is_made_once(desk, monkeypatch):
+def test_a_toy_is_made_once(in_tmp_dir, monkeypatch):
     make_toy = mock.Mock(return_value=toy())
     monkeypatch.setattr(data_prep, "make_toy", make_toy)
     data_prep.open_scene("toy")
-    assert_same(data_prep.open_scene("toy", 3), toy())
+    assert_same_arrays(data_prep.open_scene("toy", 3), toy())
     make_toy.assert_called_once_with()
 
 
 @pytest.mark.parametrize("home", ["data/sacre", "data/sacre_coeur"])
-def test_scenes_known_by_name_lie_in_data(desk, source, home):
+def test_scenes_known_by_name_lie_in_data(in_tmp_dir, source, home):
     with pytest.raises(UserError, match="python data_prep.py sacre --download"):
         data_prep.open_scene("sacre")
     write_folder(source, folder=home)
@@ -1165,28 +1008,209 @@ def test_scenes_known_by_name_lie_in_data(desk, source, home):
     assert Path("data/sacre.npz").exists()
 
 
-# ---- damaged models ------------------------------------------------------------------------------
-@pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin"])
-def test_a_damaged_model_is_refused_in_little_memory(tmp_path, source, name):
-    model = colmap_model(source)
-    model.names = model.names[:2]
-    model.x = model.x[:3]
-    model.views[:3] = 2
-    model.sightings = np.zeros((2, 1), int)
-    write_model(model, tmp_path)
-    path = tmp_path / name
-    good = path.read_bytes()
+# ---- masks ---------------------------------------------------------------------------------------
+BLACK_LEFT = np.uint8([[0, 255]] * 2)
 
-    def read(data):
-        path.write_bytes(data)
-        return data_prep.read_photos(tmp_path), data_prep.read_points(tmp_path)
-    assert attempt(read, good)
-    for size in range(0, len(good), 3):
-        assert attempt(read, good[:size]) is None
-    for at in range(len(good) - 7):
-        for number in (2 ** 40, 2 ** 64 - 1):  # also as a count
-            _, size = peak(attempt, read, good[:at] + pack("Q", number) + good[at + 8:])
-            assert size < 2 ** 21
+
+@pytest.mark.parametrize("folder", [IMAGES / "masks", MASKS], ids=["within", "beside"])
+@pytest.mark.parametrize("name, mask_name", [
+    ("toy_000.png", "toy_000.png"),
+    ("toy_000.jpg", "toy_000.png"),
+    ("toy_000.jpg", "toy_000.jpg.png"),
+    ("toy_000.jpg", "toy_000.jpg")])
+def test_black_pixels_of_masks_are_left_out(model, source, folder, name, mask_name):
+    change("names", 0, name)(model)
+    PHOTO.rename(IMAGES / name)
+    TABLE.unlink()
+    w, h = source["wh"][0]
+    mask = cv2.resize(BLACK_LEFT, (2 * w, 2 * h), interpolation=cv2.INTER_NEAREST)
+    put(folder / mask_name, encoded(mask, Path(mask_name).suffix))
+    code, out, err = run_main("place --downscale 1")
+    scene = data_prep.open_scene("place", 1)
+    masked = photo(scene, 0, "masked")
+    share = scene["masked"].mean()
+    assert f"1 of 10 photos have a mask: {share:.0%} of all pixels are black" in out
+    assert masked[:, :w // 2].all()
+    assert masked.sum() == scene["masked"].sum() == h * (w // 2)
+
+
+@cases(
+    "name, mask, says",
+    black=("toy_000.png", BLACK, "is black all over"),
+    nearly_black=("toy_000.png", BLACK + 1, "is black all over"),
+    turned=("toy_000.png", BLACK.T + 255, "has 27 x 40 pixels, its photo 40 x 27"),
+    of_no_photo=("other.png", BLACK + 255, "no name in it, such as other.png, is a photo's"))
+def test_a_mask_that_cannot_be_used_is_named(model, name, mask, says):
+    put(MASKS / name, encoded(mask))
+    code, out, err = run_main("place")
+    assert code == 0
+    assert says in err
+    assert "masked" not in data_prep.open_scene("place")
+
+
+# ---- the toy -------------------------------------------------------------------------------------
+def scene_sdf(scene, x, **knobs):
+    """Signed distance of the toy at x (P,3), both in scene units -> (P,)"""
+    return data_prep.toy_sdf(world(scene, x), **knobs) / scene["scale"]
+
+
+@pytest.mark.parametrize("number", [1, 3, 10])
+def test_every_landmark_is_another_building(number):
+    parts = data_prep.toy_landmark(number)
+    first = data_prep.toy_landmark(0)
+    shift = [lengths(a.center - np.array(b.center)) for a, b in zip(parts, first)]
+    assert max(shift) > .1
+    assert [part.material for part in parts] != [part.material for part in first]
+
+
+@pytest.mark.parametrize("number", [1, 3, 10])
+def test_no_part_hangs_in_the_air(number):
+    parts = data_prep.toy_landmark(number)
+    for part in parts:
+        foot = np.array([part.center]) - [0, 0, part.half[2]]
+        others = [other for other in parts + data_prep.TOWN if other is not part]
+        assert min(data_prep.part_sdf(other, foot)[0] for other in others) < .02
+
+
+@pytest.mark.parametrize("number", [0, 4])
+def test_a_landmark_fills_the_unit_sphere(number):
+    scene = toy(landmark=number)
+    x = np.random.default_rng(0).uniform(-1.5, 1.5, (60_000, 3))
+    distance = scene_sdf(scene, x, background=False, landmark=number)
+    reach = lengths(x[distance < 0]).max()
+    assert .75 < reach < 1
+
+
+@cases(
+    "shape, top, x, distance",
+    ground=("ground", 3, (1, 2, .5), .5),
+    corner=("box", 3, (5, 5, 7), 7),
+    inside=("box", 3, (1, 0, .5), -.5),
+    # 3-4-5 triangles: the slanted side falls 1.5 over 2.
+    roof=("box", 1.5, (6.25, 0, 3), 5),
+    cone=("column", 1.5, (0, 6.25, 3), 5),
+    upper_edge=("column", 3, (4.2, 5.6, 4), 5),
+    ball=("ball", 3, (3, 4, 12), 10))
+def test_distances_to_parts_equal_closed_forms(shape, top, x, distance):
+    center = np.array([10, 20, 30])
+    part = data_prep.Part(shape, center, half=(3, 2, 1), material="gold", top=top)
+    assert_arrays_close(data_prep.part_sdf(part, np.array([center + x])), distance)
+
+
+@cases("i, knobs", town=(4, {}), alone=(3, dict(background=False)), other=(2, dict(landmark=4)))
+def test_depth_is_where_the_distance_vanishes(i, knobs):
+    scene = toy(**knobs)
+    c2w = scene["c2w"][i]
+    d = data_prep.ray_directions(scene["K"][i], c2w, *scene["wh"][i])
+    t = np.zeros(len(d))
+    for _ in range(300):  # sphere tracing
+        x = c2w[:, 3] + t[:, None] * d
+        t += scene_sdf(scene, x, **knobs)
+    depth = photo(scene, i, "depth").ravel()
+    assert_arrays_close(np.minimum(t, 6), np.minimum(depth, 6), atol=.01)
+
+
+def test_rays_end_on_the_part_they_hit():
+    parts = data_prep.toy_parts(0)
+    o = np.array([[0, -4.0, 1]])
+    d = np.random.default_rng(0).uniform(-1, 1, (999, 3))
+    t, which = data_prep.trace(o, d, parts)
+    x = o + np.minimum(t, 20)[:, None] * d
+    distance = [data_prep.part_sdf(parts[i], x[n:n + 1])[0] for n, i in enumerate(which)]
+    assert len(np.unique(which)) > 9
+    assert_arrays_close(np.array(distance)[t < 20], 0)
+
+
+def test_surface_truth_agrees_with_the_distance_function():
+    scene = toy()
+    before = scene["wall"] + .004 * scene["wall_normal"]
+    assert_arrays_close(np.median(scene_sdf(scene, before)), .004, atol=1e-4)
+    assert_arrays_close(scene_sdf(scene, scene["near_wall"]), scene["near_wall_sdf"])
+    assert np.abs(scene["near_wall_sdf"]).max() < .05
+
+
+def test_the_ground_behind_a_tower_is_darker():
+    parts = data_prep.toy_parts(0)
+    o = np.array([[1.6, 1.1, 5], [.1, -.75, 5]])  # above the ground behind and before it
+    d = np.array([[1e-6, 1e-6, -1]] * 2)
+    behind, before = data_prep.shade(o, d, parts, True, data_prep.SUN, np.zeros(4)).mean(1)
+    assert behind < .6 * before
+
+
+def test_sun_changes_only_colours():
+    plain = toy(exposure=0.0)
+    other = toy(exposure=0.0, sun=90.0)
+    changed = np.abs(plain["rgb"].astype(float) - other["rgb"]).max(1) > 20
+    is_sky = np.isinf(plain["depth"])
+    assert_same_arrays(plain, other, "c2w", "points", "depth", "occluder", "track_point")
+    assert changed.mean() > .05
+    assert changed[is_sky].mean() < .1 * changed.mean()
+
+
+def test_photos_differ_in_exposure_by_the_knob():
+    plain, usual, extreme = [toy(exposure=knob)["exposure_spread"] for knob in (0.0, 1.0, 2.0)]
+    assert plain < .5 * usual
+    assert usual < .6 * extreme
+
+
+def test_people_cover_their_share_of_training_photos():
+    plain = toy(exposure=0.0, occluders=0.0, photos=16)
+    other = toy(exposure=0.0, occluders=.3, photos=16)
+
+    people = other["occluder"]
+    before = plain["rgb"].astype(float)
+    assert np.array_equal(before[~people], other["rgb"][~people])
+    assert (other["rgb"] > before + 50)[people].mean() > .05  # in colours
+
+    shares = np.array([photo(other, i, "occluder").mean() for i in range(18)])
+    training = shares[~other["is_test"]]
+    assert .21 < training.mean() < .48  # asked for: .3
+    assert training.max() > 2 * training.min()
+    assert not shares[other["is_test"]].any()
+
+
+def test_points_lie_on_surfaces_in_plain_view():
+    scene = toy(size=48, photos=12, occluders=.3)
+    miss = np.abs(scene_sdf(scene, scene["points"].astype(float)))
+    assert len(miss) > 1000
+    assert .001 < np.median(miss) < .006  # noise
+    assert .0005 < (miss > .03).mean() < .05  # outliers
+    seen_by = scene["track_photo"]
+    x = scene["points"][scene["track_point"]]
+    distance = lengths(x - scene["c2w"][seen_by, :, 3])
+    wh = scene["wh"][seen_by]
+    u, v = np.clip(scene["track_uv"] * wh, 0, wh - 1).astype(int).T
+    pixel = scene["start"][seen_by] + v * wh[:, 0] + u
+    is_behind = scene["depth"][pixel] < .8 * distance
+    is_hidden = is_behind | scene["occluder"][pixel]
+    assert np.bincount(scene["track_point"]).min() >= 2
+    assert is_hidden.mean() < .12
+
+
+def test_cameras_stand_upright():
+    down = toy(pose_noise=3.0)["c2w"][:, :, 1]
+    assert down[:, 2].max() < -.5
+
+
+def test_pose_noise_moves_training_cameras_only():
+    clean = toy()
+    noisy = toy(pose_noise=3.0)
+    is_moved = (clean["c2w"] != noisy["c2w"]).any((1, 2))
+    assert_same_arrays(clean, noisy, "rgb", "points", "center")
+    assert np.array_equal(is_moved, ~clean["is_test"])
+
+
+def test_pose_noise_is_in_pixels_rms():
+    rng = np.random.default_rng(0)
+    K = np.array([50, 50, 16, 16])
+    shift = []
+    for _ in range(500):
+        c2w = np.eye(3, 4)
+        c2w[2, 3] = -4  # looks at the landmark
+        data_prep.add_pose_noise(rng, K, c2w, 2.0)
+        uv, _ = data_prep.project(K, c2w, np.zeros((1, 3)))
+        shift.append(lengths(uv - 16))
+    assert abs(np.mean(np.square(shift)) - 4) < .4
 
 
 # ---- downloads -----------------------------------------------------------------------------------
@@ -1217,7 +1241,7 @@ def archive(members):
 
 
 @pytest.fixture
-def server(desk, monkeypatch):
+def server(in_tmp_dir, monkeypatch):
     """A server of files, with ranges or of status 200; breaks off after `limit` bytes."""
     server = SimpleNamespace(status=206, limit=None, asked=[])
     server.files = {TAR: archive(GOOD), "brandenburg.tsv": b"table"}
@@ -1284,14 +1308,14 @@ def test_what_is_there_is_not_downloaded(server):
     link_to_root=("images/link", "/etc"),
     link_with_dots=("images/link", "../../../.."),
     folder_is_link=("images", "/tmp"))
-def test_archives_cannot_write_outside(server, desk, name, content):
+def test_archives_cannot_write_outside(server, in_tmp_dir, name, content):
     evil = {DENSE + name: content, DENSE + "images/link/evil.txt": b"x"}
     server.files[TAR] = archive(GOOD | evil)
     with contextlib.suppress(UserError):
         data_prep.download("brandenburg")
     assert not Path("data/evil.txt").exists()
-    assert not any(path.is_symlink() for path in desk.rglob("*"))
-    assert os.listdir(desk) == ["data"]
+    assert not any(path.is_symlink() for path in in_tmp_dir.rglob("*"))
+    assert os.listdir(in_tmp_dir) == ["data"]
 
 
 @cases(
@@ -1306,46 +1330,9 @@ def test_damaged_archives_leave_nothing(server, damage):
     assert sorted(os.listdir("data")) == ["brandenburg.tsv", TAR]
 
 
-# ---- command line --------------------------------------------------------------------------------
-def test_the_command_line_has_every_knob(desk):
-    code, out, err = run_main(
-        "toy --size 32 --photos 6 --test 2 --no-background --occluders .2 --seed 1")
-    scene = data_prep.read_scene("data/toy.npz")
-    assert code == 0
-    assert "data/toy.npz: 8 photos, 2 of them" in out
-    assert_same(scene, toy(occluders=.2, background=False, seed=1))
-    assert (scene["K"] != toy()["K"]).any()  # of another seed
-
-
-WRONG = """
-toy --sizee 9, toy --siz 32, toy --size x, toy --size 15, toy --photos 3,
-toy --test -1, toy --seed -1, toy --landmark -1, toy --occluders .61,
-toy --exposure -1, toy --exposure 2.1, toy --pose_noise -1, toy --pose_noise nan,
-toy --pose_noise inf, toy --sun -1, toy --sun 181, toy --sky -1, toy --sky 1.1,
-toy --downscale 4, toy --split x.tsv, place --split x.tsv, place --downscale 0,
-place --downscale 16, place --size 9, brandenburg, nowhere, x --download
-"""
-
-
-@pytest.mark.parametrize("command", ["", *map(str.strip, WRONG.split(","))])
-def test_misspelt_commands_exit_with_2(model, command):
-    assert_error("error: ", command)
-
-
-@cases(
-    "happens, says",
-    ctrl_c=(KeyboardInterrupt, "stopped"),
-    sigterm=(lambda **knobs: signal.raise_signal(signal.SIGTERM), "stopped"),
-    full_disk=(OSError(28, "No space left"), "No space left"))
-def test_a_stop_is_one_sentence(desk, monkeypatch, happens, says):
-    make_toy = mock.create_autospec(data_prep.make_toy, side_effect=happens)
-    monkeypatch.setattr(data_prep, "make_toy", make_toy)
-    assert_error(says, "toy")
-
-
 # ---- SfM -----------------------------------------------------------------------------------------
 @pytest.fixture
-def raw(desk, source):
+def raw(in_tmp_dir, source):
     """A folder of raw photos; the path to them."""
     write_folder(source, folder="raw", images="images")
     shutil.rmtree("raw/dense")
@@ -1437,6 +1424,43 @@ def test_sfm_tells_what_is_wrong(pycolmap, raw, spoil, says):
     assert_error(says, "raw --sfm")
 
 
+# ---- command line --------------------------------------------------------------------------------
+def test_the_command_line_has_every_knob(in_tmp_dir):
+    code, out, err = run_main(
+        "toy --size 32 --photos 6 --test 2 --no-background --occluders .2 --seed 1")
+    scene = data_prep.read_scene("data/toy.npz")
+    assert code == 0
+    assert "data/toy.npz: 8 photos, 2 of them" in out
+    assert_same_arrays(scene, toy(occluders=.2, background=False, seed=1))
+    assert (scene["K"] != toy()["K"]).any()  # of another seed
+
+
+WRONG = """
+toy --sizee 9, toy --siz 32, toy --size x, toy --size 15, toy --photos 3,
+toy --test -1, toy --seed -1, toy --landmark -1, toy --occluders .61,
+toy --exposure -1, toy --exposure 2.1, toy --pose_noise -1, toy --pose_noise nan,
+toy --pose_noise inf, toy --sun -1, toy --sun 181, toy --sky -1, toy --sky 1.1,
+toy --downscale 4, toy --split x.tsv, place --split x.tsv, place --downscale 0,
+place --downscale 16, place --size 9, brandenburg, nowhere, x --download
+"""
+
+
+@pytest.mark.parametrize("command", ["", *map(str.strip, WRONG.split(","))])
+def test_misspelt_commands_exit_with_2(model, command):
+    assert_error("error: ", command)
+
+
+@cases(
+    "happens, says",
+    ctrl_c=(KeyboardInterrupt, "stopped"),
+    sigterm=(lambda **knobs: signal.raise_signal(signal.SIGTERM), "stopped"),
+    full_disk=(OSError(28, "No space left"), "No space left"))
+def test_a_stop_is_one_sentence(in_tmp_dir, monkeypatch, happens, says):
+    make_toy = mock.create_autospec(data_prep.make_toy, side_effect=happens)
+    monkeypatch.setattr(data_prep, "make_toy", make_toy)
+    assert_error(says, "toy")
+
+
 # ---- models and rays for tests -------------------------------------------------------------------
 def tiny(**changes):
     return geonvs.Config(**TINY | changes)
@@ -1497,10 +1521,10 @@ def test_a_ray_projects_back_to_its_pixel(odd):
     x = rays.at(t)[:, 0].numpy()
     found, distance = data_prep.project(odd.raw["K"][1], odd.raw["c2w"][1], x)
     pixels = torch.cartesian_prod(torch.arange(h), torch.arange(w)).flip(1) + 0.5  # centres
-    assert_close(found, pixels, 1e-3)
-    assert_close(distance, t[:, 0])
-    close(rays.uv * odd.wh[1], pixels)
-    close(rays.rgb * 255, odd.rgb[odd.start[1]:odd.start[2]], 1e-4)
+    assert_arrays_close(found, pixels, 1e-3)
+    assert_arrays_close(distance, t[:, 0])
+    assert_tensors_close(rays.uv * odd.wh[1], pixels)
+    assert_tensors_close(rays.rgb * 255, odd.rgb[odd.start[1]:odd.start[2]], 1e-4)
 
 
 @pytest.mark.parametrize("part", [1.0, 0.5])
@@ -1510,13 +1534,13 @@ def test_random_rays_cover_the_left_part_alone(odd, part):
     rays = geonvs.random_rays(odd, img, generator(), part)
     found = (rays.uv * odd.wh[1]).floor()
     wanted = torch.cartesian_prod(torch.arange(int(part * w)), torch.arange(h))
-    close(found.unique(dim=0), wanted)
+    assert_tensors_close(found.unique(dim=0), wanted)
 
 
 def test_a_thumbnail_is_the_whole_photo_upright(scene):
     quarters = cv2.resize(photo(scene.raw, 1), (2, 2), interpolation=cv2.INTER_AREA)
     found = F.adaptive_avg_pool2d(scene.thumbs[1].float(), 2)
-    close(found, quarters.transpose(2, 0, 1), 0.02)
+    assert_tensors_close(found, quarters.transpose(2, 0, 1), 0.02)
 
 
 @pytest.mark.parametrize("long_side, wanted", [(100, 64), (300, 150), (600, 256)])
@@ -1537,7 +1561,7 @@ def test_rays_are_in_the_sphere_within_their_interval(double):
     is_empty = t0 == t1
     closest = (-o * rays.d).sum(1, keepdim=True).clamp(min=0.1)
     assert torch.equal((t > t0) & (t < t1), is_inside)
-    close(t0[is_empty], closest[is_empty])
+    assert_tensors_close(t0[is_empty], closest[is_empty])
     assert (t0 <= t1).all()
 
 
@@ -1551,6 +1575,9 @@ def make_tree():
         octree.split(cells[random(len(cells)) < 0.4])
     nn.init.uniform_(octree.features, -1, 1)
     return octree
+
+
+OCTANTS = F.pad(torch.ones(2, 2, 2).nonzero(), (1, 0))  # (8,4): level 0, then i, j, k
 
 
 def plain_octree(octree):
@@ -1580,11 +1607,11 @@ def plain_octree(octree):
 def assert_one_function(model, found, wanted, trains_mask=False):
     """Two values are alike, and so are their gradients, which reach every parameter of the model,
     those of the mask only if it is trained."""
-    close(found, wanted, 1e-7)
+    assert_tensors_close(found, wanted, 1e-7)
     factor = random(*found.shape)
     wanted = gradients(model, (factor * wanted).sum())
     for name, grad in gradients(model, (factor * found).sum()).items():
-        close(grad, wanted[name], 1e-7)
+        assert_tensors_close(grad, wanted[name], 1e-7)
         assert grad.any() == (trains_mask or not name.startswith("mask")), name
 
 
@@ -1646,15 +1673,16 @@ def test_four_taps_differentiate_a_quadratic(double):
     points = x[:, None] + 0.3 * taps
     s = points @ slope + points**2 @ bend
     grad, lap = geonvs.finite_differences(s, taps, 0.3)
-    close(grad, slope + 2 * bend * x, 1e-8)
-    close(lap, 2 * bend.sum().expand(20), 1e-8)
+    assert_tensors_close(grad, slope + 2 * bend * x, 1e-8)
+    assert_tensors_close(lap, 2 * bend.sum().expand(20), 1e-8)
 
 
 def test_a_lipschitz_layer_starts_as_a_plain_one(double):
     layer = geonvs.LipschitzLinear(7, 5)
     x = random(50, 7, low=-1)
-    close(layer(x), F.linear(x, layer.weight, layer.bias))
-    close(layer.c.exp(), torch.linalg.matrix_norm(layer.weight, math.inf))  # the least bound
+    assert_tensors_close(layer(x), F.linear(x, layer.weight, layer.bias))
+    least_bound = torch.linalg.matrix_norm(layer.weight, math.inf)
+    assert_tensors_close(layer.c.exp(), least_bound)
 
 
 # ---- 5 from SDF to colour ------------------------------------------------------------------------
@@ -1668,7 +1696,7 @@ def test_inverse_cdf_inverts_the_cdf(double):
     found = geonvs.inverse_cdf(edges, weight, u)
     for row in range(4):
         cdf = np.append(0, weight[row].cumsum(0) / weight[row].sum())
-        close(found[row], np.interp(u[row], cdf, edges[row]), 1e-9)
+        assert_tensors_close(found[row], np.interp(u[row], cdf, edges[row]), 1e-9)
 
 
 @pytest.mark.parametrize("refresh", ["refresh", "refresh_coarse"])
@@ -1677,7 +1705,7 @@ def test_the_cache_is_linear_between_its_points(refresh):
     slope = torch.tensor([1.0, 10, 100])
     x = 0.5 * random(5, 7, 3, low=-1)  # in the sphere
     getattr(cache, refresh)(lambda x: x @ slope)
-    close(cache.sdf(x), x @ slope, 1e-4)
+    assert_tensors_close(cache.sdf(x), x @ slope, 1e-4)
 
 
 def test_a_coarse_cache_is_exact_at_its_points():
@@ -1685,7 +1713,7 @@ def test_a_coarse_cache_is_exact_at_its_points():
     cache.refresh_coarse(lambda x: x.square().sum(1))
     square = torch.linspace(-1, 1, 3) ** 2
     wanted = square[:, None, None] + square[:, None] + square
-    close(cache.volume[0, 0, ::3, ::3, ::3], wanted)
+    assert_tensors_close(cache.volume[0, 0, ::3, ::3, ::3], wanted)
 
 
 def test_central_differences_are_exact_for_quadratics(double):
@@ -1697,8 +1725,9 @@ def test_central_differences_are_exact_for_quadratics(double):
         e_grad, e_curv = geonvs.central_differences(s.reshape(9, 9, 9))
         wanted = ((slope + 2 * bend * x).norm(dim=1) - 1) ** 2
         inner = (slice(2, -2),) * 3  # the border lacks neighbours
-        close(e_grad[inner], wanted.reshape(9, 9, 9)[inner])
-        close(e_curv[inner], (2 * bend.sum() * 0.25).expand(5, 5, 5))  # 0.25: side of a voxel
+        assert_tensors_close(e_grad[inner], wanted.reshape(9, 9, 9)[inner])
+        wanted_curv = 2 * bend.sum() * 0.25  # 0.25: side of a voxel
+        assert_tensors_close(e_curv[inner], wanted_curv.expand(5, 5, 5))
 
 
 def test_turns_renew_what_is_near_and_an_eighth():
@@ -1734,12 +1763,12 @@ def test_samples_crowd_at_the_first_surface(double):
             return geonvs.neus_alpha(sdf, min(zeta, max_zeta))
         return cache.sample(rays, *ends, jitter, alpha)
     t = sample(jitter)
-    close(t[:, [0, -1]], torch.hstack(ends))
+    assert_tensors_close(t[:, [0, -1]], torch.hstack(ends))
     assert (t.diff() >= 0).all()
     assert 0.7 < ((t - 2.6).abs() < 0.1).float().mean() < 0.9  # the slab begins at 2.6
     assert 0.06 < (t > 3).float().mean() < 0.14
     assert (t <= sample((jitter + 1) / 2)).all()
-    close(sample(jitter, 64000.0), t)  # not below a voxel
+    assert_tensors_close(sample(jitter, 64000.0), t)  # not below a voxel
 
 
 def plain_sdf(model, x):
@@ -1920,7 +1949,7 @@ def test_a_grazing_ray_ends_on_the_surface(warm):
     assert 0.2 < grazing < 0.8
     assert missing < 0.01
     assert hitting > 0.99
-    assert_close(z, [0, far_side[1], -0.25], atol=0.1)
+    assert_arrays_close(z, [0, far_side[1], -0.25], atol=0.1)
 
 
 def test_pictures_take_the_middle_of_every_stratum(warm):
@@ -1928,7 +1957,7 @@ def test_pictures_take_the_middle_of_every_stratum(warm):
     code = warm.codes()[rays.img]
     middle = torch.full((8, warm.random_per_ray), 0.5)
     wanted = geonvs.render_rays(warm, rays, code, middle, rays.o)["rgb"]
-    close(warm.render(rays, code)["rgb"], wanted)
+    assert_tensors_close(warm.render(rays, code)["rgb"], wanted)
 
 
 # ---- 6 photos in the wild ------------------------------------------------------------------------
@@ -1940,7 +1969,7 @@ def test_the_mask_starts_low_at_half_size(warm):
     assert 0.02 < logits.sigmoid().mean() < 0.2
     mask.stages = mask.heads = nn.ModuleList([nn.Identity()])  # leaves what the network reads
     halved = F.avg_pool2d(mask.thumbs[[3]].float(), 2)
-    close(mask.logits([3]), halved / 255 - 0.5)
+    assert_tensors_close(mask.logits([3]), halved / 255 - 0.5)
 
 
 def test_pixels_that_show_sfm_points_are_static(scene):
@@ -1955,12 +1984,12 @@ def test_pixels_that_show_sfm_points_are_static(scene):
 def test_outliers_that_the_network_suspects_are_rejected(done, least):
     mask = (torch.arange(100) + 0.5) / 100
     wanted = torch.where(mask > least, 1.0, mask)
-    close(geonvs.reject_outliers(mask, mask > 0, done), wanted)
+    assert_tensors_close(geonvs.reject_outliers(mask, mask > 0, done), wanted)
 
 
 def test_phi_has_a_width_of_its_own():
     phi = geonvs.edge_indicator(torch.tensor(2.001), 1, torch.full((3,), 2.0))
-    close(phi, 1 / (1 + math.exp(-1)), 1e-3)
+    assert_tensors_close(phi, 1 / (1 + math.exp(-1)), 1e-3)
 
 
 def test_running_quantiles_equal_a_plain_loop():
@@ -1975,7 +2004,7 @@ def test_running_quantiles_equal_a_plain_loop():
         is_below = values[chosen] < wanted[n]
         wanted[n] *= torch.exp(0.1 * (level[chosen] - is_below.float()).mean())
     geonvs.update_running_quantiles(running, level, group, values, is_chosen)
-    close(running, wanted)
+    assert_tensors_close(running, wanted)
 
 
 def test_errors_in_all_photos_are_no_transients(warm):
@@ -2017,15 +2046,15 @@ def test_statistics_follow_the_rays_they_are_about(warm):
     for r in range(40):
         wanted[node[r, -1]] += columns[r]
     warm.update_statistics(rays, out)
-    close(octree.cell_error, wanted)
+    assert_tensors_close(octree.cell_error, wanted)
     for _ in range(400):
         warm.update_statistics(rays, out)
     is_below = out["complexity"][:40, None] < warm.mask.complexity_quantiles
-    close(is_below.float().mean(0), [0.5, 0.75, 0.95], 0.02)
+    assert_tensors_close(is_below.float().mean(0), [0.5, 0.75, 0.95], 0.02)
     is_used = ~rays.is_masked
     cell = geonvs.place_cell(torch.zeros(1, 3))
     is_below = out["error"][is_used] < warm.mask.place_error[cell]
-    close(is_below.float().mean(), 0.2, 0.02)
+    assert_tensors_close(is_below.float().mean(), 0.2, 0.02)
 
 
 # ---- 7 model and objective -----------------------------------------------------------------------
@@ -2101,10 +2130,10 @@ def test_the_objective_and_its_gradients_equal_plain_loops(double, mask, zeta, d
     model.mask.place_error.uniform_(0, 0.4)
     total, log, out = model.losses(rays, photos, done, generator())
     plain = plain_losses(model, rays, done)
-    close(out["mask"].mean(), plain["mask"])
+    assert_tensors_close(out["mask"].mean(), plain["mask"])
     assert out["mask"][2] == 1  # refinement takes no notice of a person's own mask
     for name, value in log.items():
-        close(value, plain[name])
+        assert_tensors_close(value, plain[name])
     wanted = plain["rgb"] + model.cfg.lam_mask * plain["reg"]
     for name in ("eik", "curv", "gpl", "lps", "sfm"):
         wanted = wanted + getattr(model.cfg, f"lam_{name}") * plain[name]
@@ -2212,7 +2241,7 @@ def test_zeta_stays_between_a_floor_and_a_bound(warm, done, floor):
     for zeta in (1e-3, 60.0, 1e9):
         warm.deviation.data.fill_(math.log(zeta) / 10)
         warm.before_step(1, done)
-        close(warm.zeta(), min(max(zeta, floor), 32.0 * 8), 1e-4)
+        assert_tensors_close(warm.zeta(), min(max(zeta, floor), 32.0 * 8), 1e-4)
 
 
 def test_refining_moves_features_and_moments_with_corners(warm):
@@ -2232,7 +2261,7 @@ def test_refining_moves_features_and_moments_with_corners(warm):
     wanted = [number.get(key, 0) for key in octree.corner_key.tolist()]
     state = optimizer.state[octree.features]
     for table in (octree.features, state["exp_avg"], state["exp_avg_sq"]):
-        close(table[:, 1], wanted)
+        assert_tensors_close(table[:, 1], wanted)
     assert torch.equal(octree.split_keys, keys.unique())
     assert 0 in wanted
     assert state["step"] == 1
@@ -2245,7 +2274,7 @@ def test_mixed_precision_leaves_the_sdf_alone(warm, monkeypatch):
     full, _, out = warm.losses(*batch, 0, generator())
     monkeypatch.setattr(geonvs, "has_bfloat16", lambda device_type: True)
     mixed, _, mixed_out = warm.losses(*batch, 0, generator())
-    close(mixed, full, 0.01)
+    assert_tensors_close(mixed, full, 0.01)
     assert mixed != full
     for name in ("opacity", "depth", "e_grad", "e_curv"):
         assert torch.equal(mixed_out[name], out[name])
@@ -2407,7 +2436,7 @@ def read_saved():
 
 
 @pytest.fixture
-def loop(desk, monkeypatch):
+def loop(in_tmp_dir, monkeypatch):
     """The training loop alone, ten seconds a step: what it calls."""
     calls = mock.Mock()
     calls.step.return_value = dict(mse=torch.tensor(0.1))
@@ -2436,7 +2465,7 @@ def test_adams_first_step_equals_its_closed_form(warm, step, done, share):
         parameters[name].grad = torch.ones_like(grad)  # of a former step
     geonvs.training_step(warm, geonvs.make_optimizer(warm), step, done, generator())
     for name, value in warm.state_dict().items():
-        close(value, wanted[name])
+        assert_tensors_close(value, wanted[name])
 
 
 def test_a_budget_in_minutes_replaces_steps(loop):
@@ -2444,9 +2473,9 @@ def test_a_budget_in_minutes_replaces_steps(loop):
     calls = [call.args[2:4] for call in loop.step.call_args_list]
     steps, done = zip(*calls)
     assert steps == tuple(range(15))
-    assert_close(done, np.arange(15) / 15)
+    assert_arrays_close(done, np.arange(15) / 15)
     assert logged_steps() == [1, 4, 7, 10, 13, 15]  # every 30 s
-    assert_close(read_log()[0]["psnr"], 10)  # of the step's mse
+    assert_arrays_close(read_log()[0]["psnr"], 10)  # of the step's mse
     assert read_saved()["state"] == vars(state)
 
 
@@ -2468,7 +2497,7 @@ def test_refining_comes_at_shares_of_training(loop, start):
     assert events.count("step") == 20 - start
 
 
-def test_a_run_begins_anew_and_follows_its_seed(desk):
+def test_a_run_begins_anew_and_follows_its_seed(in_tmp_dir):
     run_training(steps=1, seed=1)
     other, = read_log()
     (RUN / "film.mp4").touch()
@@ -2479,7 +2508,7 @@ def test_a_run_begins_anew_and_follows_its_seed(desk):
     assert not (RUN / "film.mp4").exists()
 
 
-def test_a_finished_run_samples_by_its_last_weights(desk):
+def test_a_finished_run_samples_by_its_last_weights(in_tmp_dir):
     model, _ = run_training(steps=3)
     cache = model.cache
     wanted = model.distance(cache.points(cache.inside)).detach()
@@ -2524,7 +2553,7 @@ def train_until_killed():
     run_training(steps=8)
 
 
-def test_sigkill_and_resume_change_no_bit(scene, desk, monkeypatch):
+def test_sigkill_and_resume_change_no_bit(scene, in_tmp_dir, monkeypatch):
     code = start_child("train_until_killed").wait(120)
     saved, cfg = geonvs.read_checkpoint(CHECKPOINT, {})
     with open(RUN / "log.jsonl", "a") as log:
@@ -2563,7 +2592,7 @@ def test_a_checkpoint_holds_no_photos(loop):
 ODD = (None, -1, "x", [], {"a": 1}, torch.full((5,), 2**62), Evil("harm"))
 
 
-def test_a_bad_checkpoint_is_refused_in_one_sentence(desk):
+def test_a_bad_checkpoint_is_refused_in_one_sentence(in_tmp_dir):
     model, _ = run_training(steps=1)
     whole = CHECKPOINT.read_bytes()
     good = torch.load(CHECKPOINT)
@@ -2581,7 +2610,7 @@ def test_a_bad_checkpoint_is_refused_in_one_sentence(desk):
 
 
 @pytest.fixture
-def saved(desk, warm):
+def saved(in_tmp_dir, warm):
     """The dictionary of a checkpoint from before the first step."""
     optimizer = geonvs.make_optimizer(warm)
     geonvs.save_checkpoint(CHECKPOINT, warm, optimizer, generator(), geonvs.State())
@@ -2630,7 +2659,7 @@ def test_a_resumed_run_may_have_another_rate(saved, scene):
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=["ctrl_c", "sigterm"])
-def test_a_stopped_run_ends_its_step(desk, monkeypatch, number):
+def test_a_stopped_run_ends_its_step(in_tmp_dir, monkeypatch, number):
     step = geonvs.training_step
 
     def stop_in_step_3(*args):
@@ -2680,7 +2709,7 @@ def test_several_processes_count_all_seconds(loop, monkeypatch):
     assert state.seconds == 10  # one look at the clock, after the last step
 
 
-def test_the_first_process_makes_the_scene(desk, monkeypatch):
+def test_the_first_process_makes_the_scene(in_tmp_dir, monkeypatch):
     events = mock.Mock()
     events.open.side_effect = [None, KeyboardInterrupt]
     monkeypatch.setattr(geonvs, "RANKS", 2)
@@ -2692,7 +2721,7 @@ def test_the_first_process_makes_the_scene(desk, monkeypatch):
     assert [name for name, _, _ in events.method_calls] == ["open", "wait", "open"]
 
 
-def test_two_processes_train_one_model(desk):
+def test_two_processes_train_one_model(in_tmp_dir):
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = str(free.getsockname()[1])
     env = dict(MASTER_ADDR="127.0.0.1", MASTER_PORT=port, WORLD_SIZE="2")
@@ -2751,7 +2780,7 @@ def test_the_right_half_is_scored_in_bytes(width):
 def test_lpips_gets_the_right_half_as_numbers():
     def lpips(a, b, normalize):
         assert normalize  # from 0..1
-        assert_close(a[0, 2], b[0, 2] / 2, atol=2e-3)
+        assert_arrays_close(a[0, 2], b[0, 2] / 2, atol=2e-3)
         assert a.shape == (1, 3, 33, 40)
         return torch.tensor(0.5)
     truth = picture(33, 80, 3)
@@ -2776,8 +2805,8 @@ def test_fitted_codes_explain_each_left_half(scene):
         codes=lambda: codes, render=lambda rays, code: dict(rgb=code), scene=scene)
     start = geonvs.fit_codes(model, scene, photos, steps=0)
     found = geonvs.fit_codes(model, geonvs.load_scene(raw), photos)
-    assert_close(start, codes[scene.train].mean(0).expand(2, 3))
-    assert_close(found, 30 * photos.expand(3, 2).T / 255, atol=0.03)
+    assert_arrays_close(start, codes[scene.train].mean(0).expand(2, 3))
+    assert_arrays_close(found, 30 * photos.expand(3, 2).T / 255, atol=0.03)
 
 
 def test_without_codes_nothing_is_fitted(scene):
@@ -2869,8 +2898,8 @@ def test_a_rendered_photo_has_its_pixels_in_order(knowing, scene):
     rays = geonvs.photo_rays(scene, 1)
     assert np.array_equal(geonvs.to_uint8(seen), photo(scene.raw, 1))
     assert not rgb[:, 0].any()  # the model knows the right half
-    assert_close(normal.reshape(-1, 3), rays.d)
-    assert_close(depth.flatten(), rays.uv[:, 0])
+    assert_arrays_close(normal.reshape(-1, 3), rays.d)
+    assert_arrays_close(depth.flatten(), rays.uv[:, 0])
 
 
 def test_the_mesh_of_a_ball_faces_outwards(warm, scene):
@@ -2880,7 +2909,7 @@ def test_the_mesh_of_a_ball_faces_outwards(warm, scene):
     vertices, faces = geonvs.extract_mesh(warm)
     x = (vertices - scene.raw["center"]) / scene.raw["scale"] - centre.numpy()
     volume = np.linalg.det(x[faces]).sum() / 6  # positive if faces look outwards
-    assert_close(lengths(x), 0.25, atol=2e-3)
+    assert_arrays_close(lengths(x), 0.25, atol=2e-3)
     assert volume == pytest.approx(4 / 3 * math.pi * 0.25**3, rel=0.02)
 
 
@@ -2890,7 +2919,7 @@ def test_a_mesh_ends_at_the_unit_sphere(warm, scene):
     vertices, faces = geonvs.extract_mesh(warm)
     x = (vertices - scene.raw["center"]) / scene.raw["scale"]
     side = np.ptp(x[faces], axis=1).max()
-    assert_close(x[:, 0], 0.01, atol=1e-3)
+    assert_arrays_close(x[:, 0], 0.01, atol=1e-3)
     assert lengths(x).max() == pytest.approx(1, abs=2 * warm.eps)
     assert side == pytest.approx(warm.eps, rel=0.01)
 
@@ -2916,7 +2945,7 @@ def test_a_written_mesh_reads_back_exactly(tmp_path):
     corners = list(struct.iter_unpack("<B3i", body[5 * 27:]))
     assert re.findall(rb"element (\w+ \d)", head) == [b"vertex 5", b"face 7"]
     assert np.array_equal([row[:3] for row in rows], vertices)
-    assert_close([row[3:] for row in rows], 255 * colors, atol=0.5)
+    assert_arrays_close([row[3:] for row in rows], 255 * colors, atol=0.5)
     assert np.array_equal(corners, np.insert(faces, 0, 3, axis=1))
 
 
@@ -2929,7 +2958,7 @@ def test_vertices_have_the_colours_of_rays(warm):
     warm.deviation.data.fill_(0.8)  # a sharp surface
     warm.background = None
     rgb = warm.render(rays, code.expand(9, -1))["rgb"]
-    assert_close(colors, rgb.detach(), atol=0.02)
+    assert_arrays_close(colors, rgb.detach(), atol=0.02)
 
 
 def test_depth_is_red_near_blue_far():
@@ -2942,7 +2971,7 @@ def test_depth_is_red_near_blue_far():
 
 
 @pytest.mark.parametrize("mask, count", [("on", 5), ("off", 4)])
-def test_a_panel_shows_its_columns_in_order(warm, scene, desk, monkeypatch, mask, count):
+def test_a_panel_shows_its_columns_in_order(warm, scene, in_tmp_dir, monkeypatch, mask, count):
     def render_photo(model, scene, photo, code):
         assert torch.equal(code, codes[photo])
         pictures = [np.full((24, 16, 3), color) for color in np.eye(3) / 2]
@@ -2959,7 +2988,7 @@ def test_a_panel_shows_its_columns_in_order(warm, scene, desk, monkeypatch, mask
     assert (tiles == np.array(wanted[:count])[:, None]).all()
 
 
-def test_a_film_sways_and_changes_its_light(warm, odd, desk, monkeypatch):
+def test_a_film_sways_and_changes_its_light(warm, odd, in_tmp_dir, monkeypatch):
     small = odd._replace(wh=odd.wh - 1)  # a codec wants even sides
     w, h = small.wh[0].tolist()
     frame = np.full((h, w, 3), [1.0, 0, 0])
@@ -2976,8 +3005,8 @@ def test_a_film_sways_and_changes_its_light(warm, odd, desk, monkeypatch):
     video = cv2.VideoCapture("a.mp4")
     blue, _, red, _ = cv2.mean(video.read()[1])
     assert set(photos) == {0}
-    close(cameras, wanted)
-    close(torch.stack(lights), first + share * (last - first))
+    assert_tensors_close(cameras, wanted)
+    assert_tensors_close(torch.stack(lights), first + share * (last - first))
     assert video.get(cv2.CAP_PROP_FRAME_COUNT) == 96
     assert red > 200
     assert blue < 50
@@ -2989,7 +3018,7 @@ FLAGS = "--name=a " + " ".join(f"--{key}={value}" for key, value in TINY.items()
 
 
 @pytest.fixture
-def command(desk, monkeypatch, capsys):
+def command(in_tmp_dir, monkeypatch, capsys):
     """Runs a command line in a folder with the tiny toy; returns exit code and stderr."""
     data_prep.write_scene(Path("data/toy.npz"), toy())
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 0)
