@@ -184,7 +184,7 @@ class Scene(NamedTuple):
     points: Tensor  # (Q,3) SfM points
     masked: Tensor  # (N,) whether a user's mask file excludes the pixel; (0,) without such files
     thumbs: Tensor  # (I,3,n,n) uint8, whole photos for the mask network
-    static: Tensor  # (I,n/2,n/2) mask pixels in which the photo saw an SfM point [D7]
+    sfm_pixels: Tensor  # (I,n/2,n/2) mask pixels in which the photo saw an SfM point [D7]
     train: Tensor  # (.,) indices of the training photos
     test: Tensor  # (.,) indices of the held-out photos
     raw: dict  # the file in numpy: names, statistics, center, scale, ground truth of the toy
@@ -201,11 +201,11 @@ def load_scene(raw, device="cpu"):
     uv = raw["track_uv"]  # (T,2)
     is_seen = ((uv >= 0) & (uv < 1)).all(1)  # (T,) the point lies in the picture
     col, row = (uv[is_seen] * n).astype(int).T
-    static = np.zeros((len(thumbs), n, n), bool)
-    static[raw["track_photo"][is_seen], row, col] = True
+    sfm_pixels = np.zeros((len(thumbs), n, n), bool)
+    sfm_pixels[raw["track_photo"][is_seen], row, col] = True
     arrays = [raw[key] for key in Scene._fields[:7]]  # the file has these under the same names
     arrays.append(raw.get("masked", np.zeros(0, bool)))
-    arrays += [np.moveaxis(thumbs, 3, 1), static]
+    arrays += [np.moveaxis(thumbs, 3, 1), sfm_pixels]
     is_test = raw["is_test"]
     arrays += [np.flatnonzero(~is_test), np.flatnonzero(is_test)]
     tensors = []
@@ -232,7 +232,7 @@ class Rays(NamedTuple):
     img: Tensor  # (R,) photo index
     uv: Tensor  # (R,2) pixel position over photo size, 0..1
     rgb: Tensor  # (R,3) the photo's colour
-    is_static: Tensor  # (R,) whether the mask's pixel shows an SfM point [D7]
+    has_sfm: Tensor  # (R,) whether the mask's pixel shows an SfM point [D7]
     is_masked: Tensor  # (R,) whether a user's mask file excludes the pixel
 
     def at(self, t):
@@ -253,12 +253,12 @@ def make_rays(scene, img, pixel):
     index = scene.start[img] + pixel  # (R,) among all pixels
     rgb = scene.rgb[index] / 255
     uv = xy / wh  # (R,2)
-    col, row = (uv * scene.static.shape[1]).long().unbind(1)  # (R,) of the mask's pixel
-    is_static = scene.static[img, row, col]
-    is_masked = torch.zeros_like(is_static)
+    col, row = (uv * scene.sfm_pixels.shape[1]).long().unbind(1)  # (R,) of the mask's pixel
+    has_sfm = scene.sfm_pixels[img, row, col]
+    is_masked = torch.zeros_like(has_sfm)
     if len(scene.masked):
         is_masked = scene.masked[index]
-    return Rays(c2w[..., 3], d, scene.near[img, None], img, uv, rgb, is_static, is_masked)
+    return Rays(c2w[..., 3], d, scene.near[img, None], img, uv, rgb, has_sfm, is_masked)
 
 
 def uniform(gen, *shape):
@@ -1135,7 +1135,7 @@ class GeoNVS(nn.Module):
                 logit = sample_logits(self.mask.logits(photos), rays.uv)  # (R,)
             M = logit.sigmoid()
             # SfM pixels count as if they had no error: they train M = 0 [D7]
-            excess = error * ~rays.is_static - self.mask.threshold(out["place"])
+            excess = error * ~rays.has_sfm - self.mask.threshold(out["place"])
             reg = mask_loss(logit, excess * ~rays.is_masked)
             gpl = gpl_loss(M, phi * ~rays.is_masked)
             left_out = reject_outliers(M.detach(), excess > 0, done)

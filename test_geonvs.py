@@ -1893,7 +1893,7 @@ def rough_case(**changes):
     but the first misses the sphere, the second starts in it, a person's mask leaves the third out;
     their photos."""
     scene = geonvs.load_scene(toy() | dict(bg_color=np.array([0.2, 0.4, 0.6])))
-    scene.static.bernoulli_(0.5)
+    scene.sfm_pixels.bernoulli_(0.5)
     for name in ("c2w", "near", "points"):
         scene = scene._replace(**{name: getattr(scene, name).double()})
     model = make_model(scene, samples=5, **changes).double()
@@ -1977,7 +1977,7 @@ def test_pixels_that_show_sfm_points_are_static(scene):
     for photo, (u, v) in zip(scene.raw["track_photo"], scene.raw["track_uv"]):
         if 0 <= u < 1 and 0 <= v < 1:
             wanted[photo, int(v * 32), int(u * 32)] = True
-    assert torch.equal(scene.static, wanted)
+    assert torch.equal(scene.sfm_pixels, wanted)
 
 
 @pytest.mark.parametrize("done, least", [(0.0, 0.0), (0.15, 0.25), (0.3, 1.0)])
@@ -2015,7 +2015,7 @@ def test_errors_in_all_photos_are_no_transients(warm):
     error[:, 2] = 0.6  # bad where people's own masks are
     index = torch.arange(30)
     rays = fake_rays(place, place)._replace(
-        img=index // 3, is_static=index < 0, is_masked=index % 3 == 2)
+        img=index // 3, has_sfm=index < 0, is_masked=index % 3 == 2)
     out = dict(place=place, complexity=random(30), is_solid=index > 0)
     for _ in range(500):
         warm.mask.update_quantiles(rays, out, error.flatten())
@@ -2028,7 +2028,7 @@ def test_errors_in_all_photos_are_no_transients(warm):
 def test_statistics_follow_the_rays_they_are_about(warm):
     rays, _ = make_batch(warm, 1000)
     index = torch.arange(1000)
-    rays = rays._replace(is_static=index % 2 == 0, is_masked=index % 4 == 0)
+    rays = rays._replace(has_sfm=index % 2 == 0, is_masked=index % 4 == 0)
     out = dict(  # 40 of 1,000 rays end on the foreground
         is_solid=index < 40,
         complexity=torch.where(index < 40, random(1000), 50.0),
@@ -2094,7 +2094,7 @@ def plain_losses(model, rays, done):
             i, j, k = ((out["place"][r] + 2) * 8).long().tolist()
             excess = -max(0.15, 1.5 * model.mask.place_error[(32 * i + j) * 32 + k].item())
             col, row = (rays.uv[r] * 32).long()
-            if not model.scene.static[photo, row, col]:
+            if not model.scene.sfm_pixels[photo, row, col]:
                 excess += residual.max().item()
             M = logit.sigmoid()
             if not rays.is_masked[r]:
@@ -3721,7 +3721,7 @@ class Splats(PlainSplats):
         if done >= geonvs.MASK_TRAINING:
             logit = logit.detach()
         place = geonvs.contract(rays.at(distance)[:, 0])  # (R,3)
-        excess = error * ~rays.is_static - self.mask.threshold(place)
+        excess = error * ~rays.has_sfm - self.mask.threshold(place)
         cell = geonvs.place_cell(place)
         every = torch.ones_like(excess, dtype=torch.bool)
         geonvs.update_running_quantiles(
