@@ -16,8 +16,9 @@ The paper's equations
   Eq. 2  compositing weights        composite
   Eq. 3  geometry preservation      gpl_loss
   Eq. 4  edge indicator Phi         edge_indicator, complexity, SDFCache.errors, central_differences
-  Eq. 5  objective                  objective, of the losses in GeoNVS.losses:
-         L_eik, L_lps, L_reg        eikonal, lipschitz_loss, mask_loss
+  Eq. 5  objective                  objective
+         L_rgb, L_eik, L_curv       GeoNVS.losses, of rgb, e_grad, e_curv from render_rays
+         L_reg, L_lps               mask_loss, lipschitz_loss
 
 Conventions
   world     the foreground is the unit sphere; x * scale + center leads back to SfM units
@@ -26,26 +27,30 @@ Conventions
   sdf       positive outside; the normal is the unit gradient; colours are sRGB in [0, 1]
   mask      M = 1 means transient (person, car), M = 0 means static scene
   symbols   s signed distance; zeta sharpness of the surface (1 / zeta is its width); eps step of
-            finite differences; lap Laplacian; E_grad = (|grad s| - 1)^2; E_curv = |lap s| [D2]
+            finite differences; lap Laplacian; E_grad = (|grad s| - 1)^2; E_curv = |lap s| step [D2]
   shapes    R rays, S intervals of a ray (S + 1 samples), P points, N as the line says, L octree
             levels, C channels per level, V feature rows, G inputs of the colour network from
             geometry, A appearance dims, I photos in all, B of them in a batch, Q SfM points, T
-            their sightings
+            their sightings, m side of a mask, "." any length
 
 Departures from the printed paper; the tag stands at the code
   [D1]  alpha is NeuS's Eq. 13: never negative, no beta; an interval has the mean colour of its ends
-  [D2]  E_curv is |lap s| times the step; Phi follows running quantiles; opacity weighs both
-  [D3]  L_reg classifies by error, no intensity, no bimodality; early rejection; M fixed at 60 %
+  [D2]  E_curv is |lap s| times the step of its differences, else it explodes at edges; the sigmoid
+        of Phi is centred and scaled by running quantiles; L_curv and Phi count by the opacity of
+        the ray; lambda_curv is 2 in Eq. 4 alone
+  [D3]  M weighs L_rgb without gradient; L_reg trains it to classify rays by their error, without
+        intensity or bimodality; outliers are rejected early; M is fixed at 60 % of training
   [D4]  L_lps is a sum of logarithms, not a product; a layer's bound is exp(c), not softplus(c)
   [D5]  CGNet has a block a stage, GroupNorm, a head at each resolution, and reads small photos
   [D6]  the background field also renders what lies before the sphere
   [D7]  SfM points place the sphere, seed the octree, pull s and M to 0; s starts as a small sphere;
-        no off-surface penalty, no sphere loss, no warm-up
-  [D8]  samples and Phi follow a cached SDF, so L_GPL moves M alone; derivatives are taken at SfM
-        points and at one surface point a ray, whose normal its colours share
+        no off-surface penalty, no sphere loss, no warm-up phase
+  [D8]  samples and Phi follow a cached SDF; Phi has no gradient, L_GPL moves M alone; derivatives
+        are taken at and near SfM points and at one surface point a ray, whose normal its colours
+        share
   [D9]  zeta stays between a rising floor and a fixed bound
-  [D10] cells split where colours err, none is pruned, the background's stay as seeded; parts that a
-        scene does not need are off
+  [D10] cells split where colours err, none is pruned, those of the background stay as seeded; parts
+        that a scene does not need are off
 """
 import argparse
 import contextlib
@@ -70,7 +75,7 @@ from typing import NamedTuple
 
 
 def stop_at_once(*_):
-    """Handles Ctrl-C and SIGTERM while the libraries below are loaded."""
+    """Ends the program without a traceback while the libraries below are loaded, for seconds."""
     os.write(2, b"error: stopped before anything was begun\n")
     os._exit(2)
 
@@ -183,8 +188,8 @@ class Scene(NamedTuple):
     near: Tensor  # (I,) smallest useful t
     points: Tensor  # (Q,3) SfM points
     masked: Tensor  # (N,) whether a user's mask file excludes the pixel; (0,) without such files
-    thumbs: Tensor  # (I,3,n,n) uint8, whole photos for the mask network
-    sfm_pixels: Tensor  # (I,n/2,n/2) mask pixels in which the photo saw an SfM point [D7]
+    thumbs: Tensor  # (I,3,2m,2m) uint8, whole photos for the mask network
+    sfm_pixels: Tensor  # (I,m,m) mask pixels in which the photo saw an SfM point [D7]
     train: Tensor  # (.,) indices of the training photos
     test: Tensor  # (.,) indices of the held-out photos
     raw: dict  # the file in numpy: names, statistics, center, scale, ground truth of the toy
@@ -193,15 +198,15 @@ class Scene(NamedTuple):
 
 def load_scene(raw, device="cpu"):
     """Scene from the dictionary of a scene file (data_prep.open_scene, make_toy or prepare)."""
-    n = int(np.clip(np.median(raw["wh"].max(1)) / 4, 32, 128))  # px of the mask
-    side = 2 * n  # px, half of a photo's long side [D5]
+    mask_side = int(np.clip(np.median(raw["wh"].max(1)) / 4, 32, 128))  # px
+    side = 2 * mask_side  # px, half of a usual photo's long side; photos become squares [D5]
     thumbs = [
         cv2.resize(pixels.reshape(h, w, 3), (side, side), interpolation=cv2.INTER_AREA)
         for pixels, (w, h) in zip(np.split(raw["rgb"], raw["start"][1:-1]), raw["wh"])]
     uv = raw["track_uv"]  # (T,2)
     is_seen = ((uv >= 0) & (uv < 1)).all(1)  # (T,) the point lies in the picture
-    col, row = (uv[is_seen] * n).astype(int).T
-    sfm_pixels = np.zeros((len(thumbs), n, n), bool)
+    col, row = (uv[is_seen] * mask_side).astype(int).T
+    sfm_pixels = np.zeros((len(thumbs), mask_side, mask_side), bool)
     sfm_pixels[raw["track_photo"][is_seen], row, col] = True
     arrays = [raw[key] for key in Scene._fields[:7]]  # the file has these under the same names
     arrays.append(raw.get("masked", np.zeros(0, bool)))
@@ -339,9 +344,11 @@ def pack_index(index, base=2**13):
 class Octree(nn.Module):
     """Feature grid over the cube [-half, half]^3 that is fine only where it has been split. Level
     0 is a dense grid of root^3 cells. Features live on corners, shared by the cells that meet
-    there. A corner that lacks one of its eight cells ("hanging") has the weight 0, so the field is
-    continuous across borders of refined regions, and 0 on the cube's faces. Where a level has no
-    cell, the features of that level are 0."""
+    there. A corner that lacks one of its eight cells ("hanging") has the weight 0, so a level's
+    features are continuous across borders of refined regions, and 0 on the cube's faces. Where a
+    level has no cell, its features are 0. A cell is a row of `cells`; `child` has the row of its
+    first child, `corner` those of its eight features; `corner_key` names the corner of each
+    feature, so that features survive a rebuild."""
     def __init__(self, half, levels, channels=4, root=ROOT):
         super().__init__()
         self.half = half
@@ -398,7 +405,7 @@ class Octree(nn.Module):
         self.child = nn.Buffer((first_child * is_split).int(), persistent=False)  # (N,) 0: none
         self.corner = nn.Buffer(row[corner].int(), persistent=False)  # (N,8) rows
         self.is_hanging = nn.Buffer(~has_feature[corner], persistent=False)  # (N,8)
-        # (N,3) sums over the rays that end in a cell: of errors, of pixel sizes there, their number
+        # (N,3) sums over rays that hit a cell: of (1 - M) error, of pixel sizes there, their number
         self.cell_error = nn.Buffer(self.features.new_zeros(len(cells), 3))
         self.finest = 2 * self.half / (self.root * 2 ** cells[-1, 0].item())  # smallest cell's side
         return is_old
@@ -473,7 +480,7 @@ def cells_to_split(octree):
     found, worst = (error * can_split).sort(descending=True)  # (N,)
     error_before = found.cumsum(0) - found  # (N,) in worse cells
     is_chosen = error_before < SPLIT_SHARE * found.sum()
-    room = (MAX_CELLS - len(level)) // 8  # positive, as seeding makes far fewer cells
+    room = (MAX_CELLS - len(level)) // 8  # never negative: seeding makes far fewer
     return octree.cells[worst[is_chosen][:room]]
 
 
@@ -629,8 +636,9 @@ def stratified(jitter):
 
 
 class SDFCache(nn.Module):
-    """s, E_grad and E_curv on a dense grid that is refreshed every CACHE_EVERY steps. It guides
-    where samples lie along a ray [D8] and gives the complexity of the geometry along it (Eq. 4)."""
+    """s, E_grad and E_curv on a dense grid that is refreshed every CACHE_EVERY steps: coarsely
+    until ZETA_RISE, then in turns, and as a whole at the end. It guides where samples lie along a
+    ray [D8] and gives the complexity of the geometry along it (Eq. 4)."""
     def __init__(self, n):
         super().__init__()
         self.n = n
@@ -646,9 +654,9 @@ class SDFCache(nn.Module):
         return voxel * (2 / (n - 1)) - 1
 
     def refresh(self, sdf, turn=None):
-        """Evaluates sdf, (P,3) to (P,), again. turn None: at every voxel in the sphere. turn k: at
-        the eighth of them with the smallest |s|, and at voxels k % 8, k % 8 + 8, ... of all, so
-        that eight turns cover them."""
+        """Evaluates sdf, (P,3) to (P,), again. Without a turn, at all voxels in the sphere. With
+        one, at a quarter of them: the eighth nearest to the surface, and every eighth voxel,
+        beginning at turn % 8, so that eight turns renew all."""
         s = self.volume[0, 0].flatten()  # (n^3,)
         chosen = [self.inside]
         if turn is not None:
@@ -661,7 +669,7 @@ class SDFCache(nn.Module):
 
     def refresh_coarse(self, sdf):
         """Evaluates sdf on a grid of half as many points along an axis, s being linear between
-        them: enough for a soft surface, an eighth of the cost. Creases count less in Phi."""
+        them: enough for a soft surface, and all of it is new. Creases count less in Phi."""
         m = self.n // 2
         points = grid_index(m, self.volume.device) * (2 / (m - 1)) - 1
         s = in_chunks(sdf, points).view(1, 1, m, m, m)
@@ -765,16 +773,16 @@ class Background(nn.Module):
         return near_color, near_transmittance, far_color, far_place
 
 
-def render_rays(model, rays, code, random, points):
-    """A batch of rays through the whole model, GeoNVS of section 7.
+def render_rays(model, rays, code, jitter, points):
+    """A batch of rays through the cache, the networks and the background of a model (section 7).
         code     (R,A)    appearance
-        random   (R,.)    in 0..1, places samples: S - 1 of the foreground, then the background's
-        points   (N,3)    more points at which derivatives are taken
+        jitter   (R,.)    in 0..1, places samples: S - 1 of the foreground, then the background's
+        points   (N,3)    more points, off the rays, at which derivatives are taken
     Returns a dictionary. depth, surface_point and place have no gradient.
         rgb            (R,3)
         opacity        (R,)      of the foreground
-        is_solid       (R,)      whether the foreground covers more than half of the ray
-        depth          (R,)      where the foreground is hit, on average
+        is_solid       (R,)      whether the foreground absorbs more than half of the ray's light
+        depth          (R,)      where the foreground is hit, on average; t1 if it is not
         surface_point  (R,3)     the point there
         place          (R,3)     where the ray ends, in contracted space: there or on the background
                                  beyond the sphere
@@ -783,9 +791,9 @@ def render_rays(model, rays, code, random, points):
         e_curv         (R,)      E_curv at surface points, times opacity
         sdf            (N,)      at points
         ray_e_grad, ray_e_curv  (R,)  averages along the ray"""
-    fg_random, bg_random = random.tensor_split([model.cfg.samples - 1], 1)
+    fg_jitter, bg_jitter = jitter.tensor_split([model.cfg.samples - 1], 1)
     t0, t1 = sphere_interval(rays)  # (R,1)
-    t = model.cache.sample(rays, t0, t1, fg_random, model.alpha)  # (R,S+1)
+    t = model.cache.sample(rays, t0, t1, fg_jitter, model.alpha)  # (R,S+1)
     x = rays.at(t)  # (R,S+1,3)
     sdf, geo = model.sdf(x)  # (R,S+1), (R,S+1,G)
     w = composite(model.alpha(sdf, t))  # (R,S)
@@ -794,8 +802,8 @@ def render_rays(model, rays, code, random, points):
     w = F.pad(w, (1, 1))  # (R,S+2)
     w_sample = 0.5 * (w[:, :-1] + w[:, 1:])  # (R,S+1)
 
-    hit = w_sample.detach()
-    depth = ((hit * t).sum(1) + 1e-3 * t1[:, 0]) / (hit.sum(1) + 1e-3)  # (R,) t1 if it hits nothing
+    weight = w_sample.detach()
+    depth = ((weight * t).sum(1) + 1e-3 * t1[:, 0]) / (weight.sum(1) + 1e-3)  # (R,)
     surface_point = rays.at(depth[:, None])[:, 0]  # (R,3)
     R = len(depth)
     taken_at = torch.cat([surface_point, points])  # (R+N,3), as one lookup is faster than two
@@ -809,7 +817,7 @@ def render_rays(model, rays, code, random, points):
     far_place = 2 * rays.d  # (R,3) infinity
     if model.background:
         near_color, near_transmittance, far_color, far_place = model.background(
-            rays, t0, t1, per_ray, bg_random)
+            rays, t0, t1, per_ray, bg_jitter)
         rgb = near_color + near_transmittance * rgb
     is_solid = opacity > 0.5
     ray_e_grad, ray_e_curv = model.cache.errors(x)
@@ -830,7 +838,8 @@ def render_rays(model, rays, code, random, points):
 
 # ---- 6 Photos in the wild: transient mask and geometry preservation ------------------------------
 
-LAMBDA_GRAD, LAMBDA_CURV = 10.0, 2.0  # of Eq. 4 (paper); as a weight of L_curv 2 exceeds L_rgb
+# of Eq. 4 (paper), which has lambda_curv in Eq. 5, too; there 2 would outweigh L_rgb [D2]
+LAMBDA_GRAD, LAMBDA_CURV = 10.0, 2.0
 MASK_TRAINING = 0.6  # share; then M is fixed, as errors of memorised people are small [D3]
 REJECTION = 0.3  # share of training in which outliers are rejected
 MIN_THRESHOLD = 0.15  # no smaller error makes a pixel transient
@@ -845,7 +854,7 @@ def complexity(e_grad, e_curv):
     return LAMBDA_GRAD * e_grad + LAMBDA_CURV * e_curv
 
 
-def edge_indicator(values, opacity, quantiles):
+def edge_indicator(ray_complexity, opacity, quantiles):
     """Phi (R,), Eq. 4: a calibrated sigmoid of the complexity, times opacity. The sigmoid is 0.5 at
     the upper quartile of the complexity of foreground rays; its width is a quarter of the range
     from their median to their 95 % quantile. quantiles (3,): 50, 75, 95 %. Complexity is never
@@ -853,7 +862,7 @@ def edge_indicator(values, opacity, quantiles):
     through air has no edge, hence the opacity. [D2]"""
     p50, p75, p95 = quantiles
     width = ((p95 - p50) / 4).clamp_min(1e-3)
-    return opacity * torch.sigmoid((values - p75) / width)
+    return opacity * torch.sigmoid((ray_complexity - p75) / width)
 
 
 def gpl_loss(mask, phi):
@@ -874,20 +883,20 @@ def mask_loss(logit, excess):
 
 def reject_outliers(mask, is_outlier, done):
     """M (R,) with outliers, rays whose error exceeds the threshold, set to 1 where M exceeds a
-    confidence. It rises from 0 to 1 over the first REJECTION of training; then nothing is rejected.
+    bar. It rises from 0 to 1 over the first REJECTION of training; then nothing is rejected.
     Early the scene must not learn people, later it must learn its own details. [D3]"""
-    confidence = (done / REJECTION) ** 2
-    return torch.where(is_outlier & (mask > confidence), 1.0, mask)
+    bar = (done / REJECTION) ** 2
+    return torch.where(is_outlier & (mask > bar), 1.0, mask)
 
 
 def update_running_quantiles(running, level, group, values, is_chosen):
     """Moves running quantiles of positive numbers, in place. running (N,): one a group; level:
     which quantile, a float or (P,); group (P,): index into running; values (P,), of which those
-    count that are chosen (P,). A quantile grows while more than a share 1 - level of its values
-    exceeds it."""
+    count that are chosen (P,). A value above pushes its quantile up by level, one below down by
+    1 - level, so that both balance at the quantile (the gradient of the pinball loss)."""
     is_below = values < running[group]  # (P,)
-    excess = (level - is_below.float()) * is_chosen
-    total = torch.zeros_like(running).index_add_(0, group, excess)
+    push = (level - is_below.float()) * is_chosen
+    total = torch.zeros_like(running).index_add_(0, group, push)
     count = torch.zeros_like(running).index_add_(0, group, is_chosen.float())
     running *= torch.exp(QUANTILE_RATE * total / count.clamp_min(1))
     running.clamp_min_(1e-6)  # as no factor leads away from 0
@@ -952,12 +961,12 @@ class TransientMask(nn.Module):
         self.place_error = nn.Buffer(torch.full((PLACE_CELLS**3,), 0.1))  # lower quantile
 
     def logits(self, photos):
-        """Transient logits (B,1,n/2,n/2) of photos (B,)."""
-        y = self.thumbs[photos] / 255 - 0.5  # (B,3,n,n)
+        """Transient logits (B,1,m,m) of photos (B,)."""
+        y = self.thumbs[photos] / 255 - 0.5  # (B,3,2m,2m)
         size = (y.shape[2] + 1) // 2
         logits = 0
         for stage, head in zip(self.stages, self.heads):
-            y = stage(y)  # (B,16,n/2,n/2), (B,32,n/4,n/4), (B,64,n/8,n/8)
+            y = stage(y)  # (B,16,m,m), (B,32,m/2,m/2), (B,64,m/4,m/4)
             logits += F.interpolate(head(y), size, mode="bilinear")
         return logits
 
@@ -1000,7 +1009,7 @@ class Parts(NamedTuple):
 
 
 def needed_parts(cfg, raw):
-    """Parts for the scene file `raw`, unless settings say on or off."""
+    """Parts for the scene file `raw`, unless settings say how many, on or off."""
     def is_on(setting, is_needed):
         return bool(is_needed) if setting == "auto" else setting == "on"
 
@@ -1036,7 +1045,7 @@ class GeoNVS(nn.Module):
         super().__init__()
         self.cfg = replace(cfg)  # a copy, as training decides --mask auto
         self.scene = scene
-        self.random_per_ray = cfg.samples - 1 + cfg.bg_samples  # they place a ray's samples
+        self.jitter_per_ray = cfg.samples - 1 + cfg.bg_samples  # they place a ray's samples
         levels, A, has_background = needed_parts(cfg, scene.raw)
         is_inside = scene.points.norm(dim=1) < 1
         self.sfm = nn.Buffer(scene.points[is_inside], persistent=False)  # (N,3), never empty
@@ -1090,23 +1099,24 @@ class GeoNVS(nn.Module):
 
     def losses(self, rays, photos, done, gen):
         """The objective of rays that come photo by photo, equally many of each of photos (B,);
-        done: share of training, 0..1. Returns the total; a dictionary of its losses and more for
-        the log; the output of render_rays, and what else update_statistics needs."""
+        done: share of training, 0..1. Returns the total; a dictionary for the log, its losses with
+        mse and the share left out; the dictionary of render_rays with error, left_out and
+        complexity (R,), which update_statistics needs."""
         cfg = self.cfg
         R = len(rays.o)
         code = self.appearance(photos).repeat_interleave(R // len(photos), 0)  # (R,A)
-        random = uniform(gen, R, self.random_per_ray)
+        jitter = uniform(gen, R, self.jitter_per_ray)
         sfm = self.sfm[random_index(gen, len(self.sfm), math.ceil(R / 4))]  # (N,3)
         near_sfm = sfm + NEAR_SFM * (2 * uniform(gen, *sfm.shape) - 1)  # (N,3)
-        points = torch.cat([sfm, near_sfm])  # (2N,3): s is 0 at the first N, L_eik is taken at all
-        out = render_rays(self, rays, code, random, points)
+        points = torch.cat([sfm, near_sfm])  # (2N,3): L_sfm is of the first N, L_eik of all
+        out = render_rays(self, rays, code, jitter, points)
         residual = (out["rgb"] - rays.rgb).abs()  # (R,3)
         error = residual.detach().amax(1)  # (R,) of the worst channel
-        mask, reg, gpl, values = self.transients(rays, photos, out, error, done)
+        left_out, reg, gpl, ray_complexity = self.transients(rays, photos, out, error, done)
 
         pull = self.zeta().detach().clamp_max(MAX_PULL)  # at first s must be free to change [D7]
         loss = dict(
-            rgb=((1 - mask) * residual.mean(1)).mean(),  # [D3]
+            rgb=((1 - left_out) * residual.mean(1)).mean(),  # [D3]
             eik=out["e_grad"].mean(),  # at surface points, at SfM points and near them [D8]
             curv=out["e_curv"].mean(),
             reg=reg,
@@ -1116,17 +1126,17 @@ class GeoNVS(nn.Module):
         total = objective(loss, cfg)
         log = loss | dict(
             mse=residual.square().mean(),
-            mask=mask.mean())  # rejected rays count as 1
-        out |= dict(error=error, mask=mask, complexity=values)
+            left_out=left_out.mean())
+        out |= dict(error=error, left_out=left_out, complexity=ray_complexity)
         return total, log, out
 
     def transients(self, rays, photos, out, error, done):
         """Section 6 for rays with out of render_rays and errors (R,). Returns what L_rgb leaves out
         (R,): M, or 1 for rejected outliers and for pixels that a user's mask excludes; L_reg;
         L_GPL; the complexity (R,) along the rays."""
-        values = complexity(out["ray_e_grad"], out["ray_e_curv"])  # (R,)
+        ray_complexity = complexity(out["ray_e_grad"], out["ray_e_curv"])  # (R,)
         opacity = out["opacity"].detach()
-        phi = edge_indicator(values, opacity, self.mask.complexity_quantiles)  # (R,)
+        phi = edge_indicator(ray_complexity, opacity, self.mask.complexity_quantiles)  # (R,)
         reg = error.new_zeros(())
         gpl = error.new_zeros(())
         left_out = torch.zeros_like(error)
@@ -1135,11 +1145,11 @@ class GeoNVS(nn.Module):
                 logit = sample_logits(self.mask.logits(photos), rays.uv)  # (R,)
             M = logit.sigmoid()
             # SfM pixels count as if they had no error: they train M = 0 [D7]
-            excess = error * ~rays.has_sfm - self.mask.threshold(out["place"])
+            excess = error.masked_fill(rays.has_sfm, 0) - self.mask.threshold(out["place"])
             reg = mask_loss(logit, excess * ~rays.is_masked)
             gpl = gpl_loss(M, phi * ~rays.is_masked)
             left_out = reject_outliers(M.detach(), excess > 0, done)
-        return left_out.masked_fill(rays.is_masked, 1), reg, gpl, values
+        return left_out.masked_fill(rays.is_masked, 1), reg, gpl, ray_complexity
 
     def before_step(self, step, done):
         """Keeps zeta within bounds and renews the cache. The floor of zeta rises with training
@@ -1165,7 +1175,7 @@ class GeoNVS(nn.Module):
         self.mask.update_quantiles(rays, out, out["error"])
         is_solid = out["is_solid"]  # (R,)
         pixel = out["depth"] / self.scene.K[rays.img, 0]  # (R,) its size at the surface point
-        error = (1 - out["mask"]) * out["error"]
+        error = (1 - out["left_out"]) * out["error"]
         columns = torch.stack([error * is_solid, pixel * is_solid, is_solid], 1)  # (R,3)
         octree = self.sdf.octree
         node, _, _ = octree.locate(out["surface_point"])
@@ -1210,8 +1220,8 @@ class GeoNVS(nn.Module):
 
     @torch.no_grad()
     def decide_mask(self):
-        """--mask auto: off if M marks hardly anything in 64 training photos; pixels that a user's
-        mask excludes count, too. [D10]"""
+        """--mask auto: off if M marks hardly anything in the first 64 training photos; pixels that
+        a user's mask excludes count, too. [D10]"""
         if self.cfg.mask == "auto":
             photos = self.scene.train[:64]
             share = self.mask.logits(photos).sigmoid().mean().item()
@@ -1224,7 +1234,7 @@ class GeoNVS(nn.Module):
 
     def render(self, rays, code):
         """render_rays with samples in the middle of their strata: for pictures, to fit codes."""
-        middle = code.new_full((len(code), self.random_per_ray), 0.5)
+        middle = code.new_full((len(code), self.jitter_per_ray), 0.5)
         return render_rays(self, rays, code, middle, rays.o[:0])
 
 
@@ -1240,12 +1250,12 @@ def open_counter(device):
     for number in range(RANKS):  # the first process has the first GPU
         uuid = torch.cuda.get_device_properties(number).uuid
         gpus.append(pynvml.nvmlDeviceGetHandleByUUID(f"GPU-{uuid}"))
-    return lambda: sum(map(pynvml.nvmlDeviceGetTotalEnergyConsumption, gpus)) / 1e3  # mJ
+    return lambda: sum(map(pynvml.nvmlDeviceGetTotalEnergyConsumption, gpus)) / 1e3  # from mJ
 
 
 def metered_joules(device, joules):
-    """Yields the joules spent until then, on top of those given; ends once a counter has failed,
-    which ends metering, not the run."""
+    """Yields the joules spent until then, on top of those given; ends once a counter has failed
+    (joules None: it had before), which ends metering, not the run."""
     try:
         counter = open_counter(device)
         begin = counter()
@@ -1263,9 +1273,9 @@ PROGRESS = ("checkpoint.pt", "log.jsonl")  # what training writes
 RESULTS = ("metrics.json", "codes.npy", "panel.png", "mesh.ply", "film.mp4")  # and held_out/
 # torchrun starts RANKS processes. Each draws its own rays and follows its own quantiles; gradients
 # are averaged; the first process decides, speaks and writes; so all hold the same weights.
-RANK = int(os.environ.get("RANK", 0))
-LOCAL_RANK = int(os.environ.get("LOCAL_RANK", RANK))  # on this machine
 RANKS = int(os.environ.get("WORLD_SIZE", 1))
+RANK = int(os.environ.get("RANK", 0)) if RANKS > 1 else 0
+LOCAL_RANK = int(os.environ.get("LOCAL_RANK", RANK)) if RANKS > 1 else 0  # on this machine
 
 
 @dataclass
@@ -1293,8 +1303,8 @@ def average_gradients(model):
 
 def training_step(model, optimizer, step, done, gen):
     """One update; the learning rate rises for 20 steps, then follows a cosine down to 5 %. done:
-    share of training, 0..1. Returns the raw terms of the loss and their weighted total. Never
-    waits for the device."""
+    share of training, 0..1. Returns the log of GeoNVS.losses and the total. Never waits for the
+    device."""
     model.before_step(step, done)
     rays, picked = model.batch(model.cfg.rays // RANKS, gen)
     loss, terms, out = model.losses(rays, picked, done, gen)
@@ -1334,7 +1344,7 @@ def scene_facts(scene):
 def check_same_scene(saved, now):
     """UserError with the first difference between the scene_facts of a checkpoint and of now."""
     advice = "use its photos, model and flags, or train under another --name"
-    photos = itertools.zip_longest(saved["name"], now["name"], fillvalue="nothing")
+    photos = itertools.zip_longest(list(saved["name"]), now["name"], fillvalue="nothing")
     for before, name in photos:
         check(before == name, f"checkpoint.pt was trained with photo {before}, and here is {name} "
               f"in its place: {advice}")
@@ -1390,7 +1400,7 @@ def restore(saved, model, gen=None):
         for octree, keys in zip(model.octrees, saved["octrees"], strict=True):
             octree.build(keys.to(octree.child.device))
         model.load_state_dict(saved["model"])
-        if RANK > 0:  # the errors of all processes are summed again
+        if RANK > 0:  # the file has the first one's, which must not be counted again
             model.sdf.octree.cell_error.zero_()
         optimizer = make_optimizer(model)
         groups = optimizer.state_dict()["param_groups"]  # learning rates may be given anew
@@ -1415,6 +1425,7 @@ def load_run(run, **given):
     with device:
         model = GeoNVS(cfg, scene)
     restore(saved, model)
+    model.after_training()  # a run that was stopped has an older cache
     codes = model.codes()
     if (run / "codes.npy").exists():  # finished: codes of test photos are fitted
         codes = torch.as_tensor(np.load(run / "codes.npy"), device=device)
@@ -1486,7 +1497,7 @@ def train(cfg, scene, run, saved=None):
                 check_finite(model, run)
                 report(run / "log.jsonl", done, state, terms)
                 save_checkpoint(run / "checkpoint.pt", model, optimizer, gen, state)
-    if is_stopped or signals:
+    if is_stopped or (signals and RANK == 0):
         raise KeyboardInterrupt(
             f"stopped; step {state.step} is saved, and the same command with --resume goes on")
     return model, state
@@ -1588,8 +1599,8 @@ def photo_rays(scene, photo):
 
 @torch.no_grad()
 def render_photo(model, scene, photo, code):
-    """A photo's view under an appearance code (A,): its colours, the photo itself, normals, each
-    (H,W,3), and depth (H,W), along the ray."""
+    """A photo's view under an appearance code (A,): its colours, the photo itself, normals as long
+    as the ray's opacity, each (H,W,3), and depth (H,W), along the ray."""
     w, h = scene.wh[photo].tolist()
     parts = []
     for pixel in torch.arange(w * h, device=code.device).split(RENDER_RAYS[code.device.type]):
@@ -1661,8 +1672,7 @@ def mask_mean(mask, chosen):
 
 def depth_edges(depth):
     """Whether a pixel of depth (H,W), distances along rays, lies beside a jump: the second
-    difference of inverse depth, nearly 0 on a plane, is 5 % of the largest of the three pixels or
-    more."""
+    difference of inverse depth, nearly 0 on a plane, exceeds 5 % of the largest of the three."""
     inverse = 1 / depth.astype(np.float32)  # 0: sky
     edges = np.zeros(depth.shape, bool)
     for q, is_edge in (inverse, edges), (inverse.T, edges.T):  # down, then across
@@ -1796,11 +1806,12 @@ def write_panel(path, model, scene, codes):
     for photo in scene.test[:2].tolist() + scene.train[:2].tolist():
         rgb, truth, normal, depth = render_photo(model, scene, photo, codes[photo])
         tiles = [to_uint8(tile) for tile in (truth, rgb, normal / 2 + 0.5)]
-        tiles.append(depth_picture(depth, np.linalg.norm(normal, axis=2)))
+        opacity = np.linalg.norm(normal, axis=2)
+        tiles.append(depth_picture(depth, opacity))
         kind = "held out" if photo in scene.test else "training"
         text = f"{kind}: {scene.raw['name'][photo]}, render, normals, depth (red: near)"
         if model.cfg.mask != "off":
-            M = model.mask.logits([photo])[0, 0].detach().sigmoid().cpu()  # (n/2,n/2)
+            M = model.mask.logits([photo])[0, 0].detach().sigmoid().cpu()  # (m,m)
             tiles.append(to_uint8(np.dstack([M] * 3)))
             text += ", mask (white: transient)"
         h, w, _ = rgb.shape
@@ -1813,7 +1824,7 @@ def write_panel(path, model, scene, codes):
 
 
 def peak_memory(device):
-    """Most bytes that were in use at a time, of the device; None on Windows."""
+    """Most bytes in use at a time, of the GPU, else of this process; None on Windows."""
     if device.type == "cuda":
         return torch.cuda.max_memory_allocated()
     try:
@@ -2017,7 +2028,7 @@ def main(argv=None):
     scene = load_scene(read_scene(cfg), device)
     with locked(run) if RANK == 0 else contextlib.nullcontext():
         if resume:
-            saved, cfg = read_checkpoint(run / "checkpoint.pt", given)
+            saved, cfg = read_checkpoint(run / "checkpoint.pt", given)  # nobody else writes now
         elif RANK == 0:
             refuse_used(run)  # what ended since is a run, too
         model, state = train(cfg, scene, run, saved)

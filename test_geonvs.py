@@ -1955,7 +1955,7 @@ def test_a_grazing_ray_ends_on_the_surface(warm):
 def test_pictures_take_the_middle_of_every_stratum(warm):
     rays, photos = make_batch(warm, 8)
     code = warm.codes()[rays.img]
-    middle = torch.full((8, warm.random_per_ray), 0.5)
+    middle = torch.full((8, warm.jitter_per_ray), 0.5)
     wanted = geonvs.render_rays(warm, rays, code, middle, rays.o)["rgb"]
     assert_tensors_close(warm.render(rays, code)["rgb"], wanted)
 
@@ -2034,12 +2034,12 @@ def test_statistics_follow_the_rays_they_are_about(warm):
         complexity=torch.where(index < 40, random(1000), 50.0),
         error=torch.where(rays.is_masked, 50.0, random(1000)),
         depth=2 + random(1000),
-        mask=random(1000),
+        left_out=random(1000),
         surface_point=random(1000, 3, low=-0.9, high=0.9),
         place=torch.zeros(1000, 3))
     octree = warm.sdf.octree
     pixel = out["depth"] / warm.scene.K[rays.img, 0]
-    error = (1 - out["mask"]) * out["error"]
+    error = (1 - out["left_out"]) * out["error"]
     columns = torch.column_stack([error, pixel, torch.ones(1000)])
     node, _, _ = octree.locate(out["surface_point"])
     wanted = torch.zeros(len(octree.cells), 3)
@@ -2110,7 +2110,7 @@ def plain_losses(model, rays, done):
         terms["rgb"] += (1 - M) * residual.mean() / 8
         terms["eik"] += out["e_grad"][r] / 12
         terms["curv"] += out["e_curv"][r] / 8
-        terms["mask"] += M / 8
+        terms["left_out"] += M / 8
     terms["lps"] = sum(layer.c for layer in model.color[::2])
     for point in points:
         _, grad, _ = plain_derivatives(model, point)
@@ -2130,8 +2130,8 @@ def test_the_objective_and_its_gradients_equal_plain_loops(double, mask, zeta, d
     model.mask.place_error.uniform_(0, 0.4)
     total, log, out = model.losses(rays, photos, done, generator())
     plain = plain_losses(model, rays, done)
-    assert_tensors_close(out["mask"].mean(), plain["mask"])
-    assert out["mask"][2] == 1  # refinement takes no notice of a person's own mask
+    assert_tensors_close(out["left_out"].mean(), plain["left_out"])
+    assert out["left_out"][2] == 1  # refinement takes no notice of a person's own mask
     for name, value in log.items():
         assert_tensors_close(value, plain[name])
     wanted = plain["rgb"] + model.cfg.lam_mask * plain["reg"]
