@@ -780,8 +780,8 @@ def render_rays(model, rays, code, jitter, points):
         points   (N,3)    more points, off the rays, at which derivatives are taken
     Returns a dictionary. depth, surface_point and place have no gradient.
         rgb            (R,3)
-        opacity        (R,)      of the foreground
-        is_solid       (R,)      whether the foreground absorbs more than half of the ray's light
+        opacity        (R,)      of the foreground, whatever lies before the sphere
+        is_solid       (R,)      whether it exceeds a half
         depth          (R,)      where the foreground is hit, on average; t1 if it is not
         surface_point  (R,3)     the point there
         place          (R,3)     where the ray ends, in contracted space: there or on the background
