@@ -2981,11 +2981,18 @@ def test_a_panel_shows_its_columns_in_order(warm, scene, in_tmp_dir, monkeypatch
     monkeypatch.setattr(geonvs, "render_photo", render_photo)
     monkeypatch.setattr(geonvs, "depth_picture", lambda depth, _: np.full((24, 16, 3), 7, np.uint8))
     warm.mask.logits = lambda photos: torch.full((1, 1, 8, 8), -0.5)
+    write_text = mock.Mock(wraps=cv2.putText)
+    monkeypatch.setattr(cv2, "putText", write_text)
     geonvs.write_panel(Path("a.png"), warm, scene, codes)
+    titles = [call.args[1] for call in write_text.call_args_list]
+    kinds = [title.split(":")[0] for title in titles]
     panel = cv2.imread("a.png")[:, :, ::-1]
     tiles = panel.reshape(4, 380, count, 240, 3)[:, 20:]  # below the titles
     wanted = [[0, 128, 0], [128, 0, 0], [128, 128, 191], [7, 7, 7], [96, 96, 96]]
     assert (tiles == np.array(wanted[:count])[:, None]).all()
+    assert kinds == ["held out", "held out", "training", "training"]
+    assert all(("mask" in title) == (mask == "on") for title in titles)
+    assert (panel.reshape(4, 380, -1)[:, :20] < 50).any((1, 2)).all()  # they are to be seen
 
 
 def test_a_film_sways_and_changes_its_light(warm, odd, in_tmp_dir, monkeypatch):
