@@ -2737,6 +2737,15 @@ def test_two_processes_train_one_model(in_tmp_dir):
     assert grad == 1.5  # the mean of 1 and 2
 
 
+def print_ranks():
+    print(geonvs.RANK, geonvs.LOCAL_RANK)
+
+
+def test_a_rank_counts_only_among_several_processes():
+    child = start_child("print_ranks", RANK="1", LOCAL_RANK="2")
+    assert child.communicate()[0].split() == ["0", "0"]
+
+
 # ---- 10 scoring, mesh, pictures ------------------------------------------------------------------
 
 def picture(*shape, seed=0):
@@ -3114,8 +3123,16 @@ def test_a_folder_is_locked_until_its_process_ends(command, flags):
 
 def test_a_run_is_loaded_in_python(command):
     command(f"{FLAGS} --appearance=on")
+    saved = read_saved()
+    weights = saved["model"]
+    stale = dict(weights, **{"cache.volume": torch.zeros_like(weights["cache.volume"])})
+    torch.save(dict(saved, model=stale), CHECKPOINT)  # as of a run that was stopped
     model, scene, codes = geonvs.load_run("runs/a", device="cpu")
-    assert_same_tensors(model.state_dict(), read_saved()["model"])
+    cache = model.cache
+    s = cache.volume[0, 0].flatten()[cache.inside]
+    assert_tensors_close(s, geonvs.in_chunks(model.distance, cache.points(cache.inside)))
+    cache.volume.zero_()
+    assert_same_tensors(model.state_dict(), stale)
     assert np.array_equal(codes, np.load(RUN / "codes.npy"))
     rgb, *_ = geonvs.render_photo(model, scene, scene.test[0], codes[scene.test[0]])
     assert np.isfinite(rgb).all()
