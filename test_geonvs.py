@@ -4320,7 +4320,7 @@ def test_an_experiment_writes_table_and_figure_and_reads_rows_again(
         quick_rows, name, rows, monkeypatch):
     monkeypatch.setitem(globals(), "PAPER", {k: PAPER[k] for k in ("full", "no mask")})
     monkeypatch.setitem(globals(), "PIECES", {k: PIECES[k] for k in ("full", "no normal")})
-    argv = [name, "--steps=4", "--seeds=1", *quick_rows]
+    argv = [name, "--steps=1", "--seeds=1", *quick_rows]
     experiment(argv)
     table = Path(f"{name}.csv").read_text()
     assert len(table.splitlines()) == 1 + rows
