@@ -1685,6 +1685,11 @@ def test_a_lipschitz_layer_starts_as_a_plain_one(double):
     assert_tensors_close(layer.c.exp(), least_bound)
 
 
+def test_a_model_starts_as_a_small_sphere(warm):
+    x = random(500, 3, low=-1, high=1)
+    assert_tensors_close(warm.distance(x), x.norm(dim=1) - geonvs.START_RADIUS, 0.05)
+
+
 # ---- 5 from SDF to colour ------------------------------------------------------------------------
 
 def test_inverse_cdf_inverts_the_cdf(double):
@@ -2992,6 +2997,7 @@ def test_a_panel_shows_its_columns_in_order(warm, scene, in_tmp_dir, monkeypatch
     warm.mask.logits = lambda photos: torch.full((1, 1, 8, 8), -0.5)
     write_text = mock.Mock(wraps=cv2.putText)
     monkeypatch.setattr(cv2, "putText", write_text)
+    scene = scene._replace(test=torch.tensor([1, 4, 6]), train=torch.tensor([0, 2, 3]))
     geonvs.write_panel(Path("a.png"), warm, scene, codes)
     titles = [call.args[1] for call in write_text.call_args_list]
     kinds = [title.split(":")[0] for title in titles]
