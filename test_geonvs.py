@@ -1972,6 +1972,12 @@ def test_the_mask_starts_low_at_half_size(warm):
     logits = mask.logits([0, 1, 2])
     assert logits.shape == (3, 1, 32, 32)
     assert 0.02 < logits.sigmoid().mean() < 0.2
+    y = mask.thumbs[[3]].float()
+    sizes = []
+    for stage in mask.stages:
+        y = stage(y)
+        sizes.append(y.shape[1:])
+    assert sizes == [(16, 32, 32), (32, 16, 16), (64, 8, 8)]
     mask.stages = mask.heads = nn.ModuleList([nn.Identity()])  # leaves what the network reads
     halved = F.avg_pool2d(mask.thumbs[[3]].float(), 2)
     assert_tensors_close(mask.logits([3]), halved / 255 - 0.5)
