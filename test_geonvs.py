@@ -1360,7 +1360,11 @@ def test_sfm_calls_pycolmap_in_order(pycolmap, raw):
     code, out, err = run_main("raw --sfm")
     calls = [call for call in pycolmap.method_calls if call[1]]
     database = calls[0][1][0]
+    sift = pycolmap.FeatureExtractionOptions().sift
+    matching = pycolmap.FeatureMatchingOptions()
     assert code == 0
+    assert sift.estimate_affine_shape is sift.domain_size_pooling is True
+    assert matching.guided_matching is True
     assert "10 posed by raw/sparse/1" in out
     assert "left out is another model: 2 posed by raw/sparse/0" in out
     assert [call[:2] for call in calls[:2]] == [
@@ -2183,7 +2187,8 @@ def test_codes_and_background_follow_scene_and_settings(scene, setting, spread, 
 @cases(
     "setting, held_out, trained, wanted",
     marks_nothing=("auto", 9.0, -9.0, "off"),
-    marks_something=("auto", -9.0, -3.0, "on"),
+    marks_under_a_percent=("auto", 9.0, -4.7, "off"),
+    marks_over_a_percent=("auto", -9.0, -4.5, "on"),
     is_off=("off", 9.0, 9.0, "off"))
 def test_an_automatic_mask_follows_training_photos(
         warm, monkeypatch, setting, held_out, trained, wanted):
@@ -2403,7 +2408,7 @@ def test_a_cpu_has_no_counter():
 def test_nvml_is_asked_for_torchs_gpus(monkeypatch, processes, joules):
     millijoules = {"GPU-0": 7000, "GPU-1": 2000}
     nvml = SimpleNamespace(
-        nvmlInit=lambda: None,
+        nvmlInit=mock.Mock(),
         nvmlDeviceGetHandleByUUID=str,
         nvmlDeviceGetTotalEnergyConsumption=millijoules.get)
     monkeypatch.setitem(sys.modules, "pynvml", nvml)
@@ -2411,6 +2416,7 @@ def test_nvml_is_asked_for_torchs_gpus(monkeypatch, processes, joules):
     monkeypatch.setattr(
         torch.cuda, "get_device_properties", lambda number: SimpleNamespace(uuid=number))
     counter = geonvs.open_counter(torch.device("cuda"))
+    nvml.nvmlInit.assert_called_once()
     assert counter() == joules
 
 
