@@ -44,7 +44,7 @@ Departures from the printed paper; the tag stands at the code
   [D5]  CGNet has a block a stage, GroupNorm, a head at each resolution, and reads small photos
   [D6]  the background field also renders what lies before the sphere
   [D7]  SfM points place the sphere, seed the octree, pull s and M to 0; s starts as a small sphere;
-        no off-surface penalty, no sphere loss, no warm-up phase
+        no off-surface penalty, no sphere loss with a warm-up
   [D8]  samples and Phi follow a cached SDF; Phi has no gradient, L_GPL moves M alone; derivatives
         are taken at and near SfM points and at one surface point a ray, whose normal its colours
         share
