@@ -2719,6 +2719,13 @@ def train_as_one_of_two():
     torch.save((weights, torch.cat(pixels), layer.weight.grad), f"{geonvs.RANK}.pt")
 
 
+def test_training_flushes_vanishing_numbers(loop, monkeypatch):
+    flush = mock.Mock()
+    monkeypatch.setattr(torch, "set_flush_denormal", flush)
+    run_training(steps=1)
+    flush.assert_called_with(True)
+
+
 def test_several_processes_count_all_seconds(loop, monkeypatch):
     monkeypatch.setattr(geonvs, "RANKS", 2)
     monkeypatch.setattr(geonvs, "from_first_process", lambda value: value)
