@@ -1344,7 +1344,7 @@ def scene_facts(scene):
 def check_same_scene(saved, now):
     """UserError with the first difference between the scene_facts of a checkpoint and of now."""
     advice = "use its photos, model and flags, or train under another --name"
-    photos = itertools.zip_longest(list(saved["name"]), now["name"], fillvalue="nothing")
+    photos = itertools.zip_longest(saved["name"], now["name"], fillvalue="nothing")
     for before, name in photos:
         check(before == name, f"checkpoint.pt was trained with photo {before}, and here is {name} "
               f"in its place: {advice}")
