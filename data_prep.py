@@ -978,184 +978,135 @@ def open_scene(name_or_folder, downscale=2):
 # Arbitrary: centre and scale of the scene must be recovered.
 TOY_SCALE = 3.7
 TOY_ORIGIN = np.array([12.0, -7.0, 5.0])
-
-
-def to_world(x):
-    """From the toy's units to those of the reconstruction. (...,3) -> (...,3)"""
-    return x * TOY_SCALE + TOY_ORIGIN
-
-
-def unit(x):
-    """The unit vector along x (3,)"""
-    return x / np.linalg.norm(x)
-
-
-SUN = unit(np.array([-0.50, -0.62, 0.60]))  # left, behind the tourists
-
-
-class Material(NamedTuple):
-    color: tuple
-    cell: tuple  # width and height of a stone, or of the wall around a window
-    contrast: float  # between cells
-    has_windows: bool = False
-
-
+SUN = np.array([-0.50, -0.62, 0.60])  # left, behind the tourists
+SUN /= np.linalg.norm(SUN)
+# Linear colour; width and height of a stone, or of the wall around a window; their contrast.
 MATERIALS = dict(
-    stone=Material((0.5, 0.46, 0.4), (0.29, 0.13), 0.2),
-    pale=Material((0.8, 0.74, 0.6), (0.29, 0.13), 0.08),
-    sand=Material((0.78, 0.56, 0.3), (0.3, 0.3), 0.15, has_windows=True),
-    brick=Material((0.52, 0.19, 0.11), (0.3, 0.3), 0.15, has_windows=True),
-    tiles=Material((0.6, 0.22, 0.12), (0.16, 0.08), 0.3),
-    slate=Material((0.12, 0.19, 0.31), (0.2, 0.1), 0.25),
-    copper=Material((0.16, 0.46, 0.36), (0.5, 0.5), 0.4),
-    gold=Material((0.9, 0.58, 0.08), (0.5, 0.5), 0),
-    plaster=Material((0.6, 0.46, 0.34), (0.62, 0.62), 0.15, has_windows=True),
-    leaf=Material((0.1, 0.22, 0.05), (0.2, 0.2), 0.45),
-    paving=Material((0.48, 0.42, 0.34), (0.42, 0.42), 0.2),
-    meadow=Material((0.17, 0.22, 0.08), (0.6, 0.6), 0.1),
+    stone=((0.5, 0.46, 0.4), (0.29, 0.13), 0.2),
+    pale=((0.8, 0.74, 0.6), (0.29, 0.13), 0.08),
+    sand=((0.78, 0.56, 0.3), (0.3, 0.3), 0.15),
+    brick=((0.52, 0.19, 0.11), (0.3, 0.3), 0.15),
+    tiles=((0.6, 0.22, 0.12), (0.16, 0.08), 0.3),
+    slate=((0.12, 0.19, 0.31), (0.2, 0.1), 0.25),
+    copper=((0.16, 0.46, 0.36), (0.5, 0.5), 0.4),
+    gold=((0.9, 0.58, 0.08), (0.5, 0.5), 0),
+    plaster=((0.6, 0.46, 0.34), (0.62, 0.62), 0.15),
+    leaf=((0.1, 0.22, 0.05), (0.2, 0.2), 0.45),
+    paving=((0.48, 0.42, 0.34), (0.42, 0.42), 0.2),
+    meadow=((0.17, 0.22, 0.08), (0.6, 0.6), 0.1),
 )
-# Other landmarks may swap materials within a group.
+WITH_WINDOWS = ("sand", "brick", "plaster")
+# Other landmarks may swap the materials of a tuple.
 INTERCHANGEABLE = [("stone", "pale"), ("sand", "brick"), ("tiles", "slate", "copper")]
 
 
 class Part(NamedTuple):
-    shape: str  # "ground", "ball", "column" (or cone), "box" (or roof)
-    center: tuple
-    half: tuple  # half width, depth and height; a ball's or column's radius
+    shape: str  # "ground" (up to a radius), "ball", "column" (or cone), "box" (or roof)
+    group: str  # parts that stand on each other
     material: str
-    top: float = None  # half width at the top; None is the same as at the bottom
-
-    @property
-    def widths(self):
-        """Half width at the bottom and at the top."""
-        bottom = self.half[0]
-        return bottom, bottom if self.top is None else self.top
+    center: tuple
+    half: tuple  # half width at the bottom, depth and height; a width is also a radius
+    top: float  # half width at the top
 
 
-PLINTH = [
-    Part("box", center=(-.01, -.03, .05), half=(.96, .53, .05), material="stone"),
-    Part("box", center=(-.05, 0, .15), half=(.85, .47, .05), material="stone"),
+LANDMARK = [
+    Part("box", "plinth", "stone", center=(-.01, -.03, .05), half=(.96, .53, .05), top=.96),
+    Part("box", "plinth", "stone", center=(-.05, 0, .15), half=(.85, .47, .05), top=.85),
+    *[Part("column", "hall", "pale", center=(x, -.34, .47), half=(.062, .062, .27), top=.05)
+      for x in np.linspace(-.54, .60, 6)],
+    Part("box", "hall", "sand", center=(.03, .2, .53), half=(.59, .26, .33), top=.59),
+    Part("box", "hall", "pale", center=(.03, .03, .8), half=(.67, .46, .06), top=.67),
+    Part("box", "hall", "tiles", center=(.03, .03, .98), half=(.71, .48, .12), top=0),
+    Part("column", "dome", "sand", center=(-.05, .22, 1.07), half=(.33, .33, .17), top=.31),
+    Part("ball", "dome", "copper", center=(-.05, .22, 1.24), half=(.3, .3, .3), top=.3),
+    Part("column", "dome", "pale", center=(-.05, .22, 1.57), half=(.075, .075, .07), top=.065),
+    Part("column", "dome", "copper", center=(-.05, .22, 1.7), half=(.1, .1, .06), top=.02),
+    Part("ball", "dome", "gold", center=(-.05, .22, 1.78), half=(.045, .045, .045), top=.045),
+    Part("box", "tower", "brick", center=(.87, .18, .53), half=(.17, .17, .53), top=.17),
+    Part("box", "tower", "pale", center=(.87, .18, 1.1), half=(.2, .2, .04), top=.2),
+    Part("column", "tower", "slate", center=(.87, .18, 1.32), half=(.2, .2, .18), top=0),
+    Part("box", "annex", "brick", center=(-.76, .24, .38), half=(.19, .25, .18), top=.19),
+    Part("box", "annex", "slate", center=(-.76, .24, .65), half=(.23, .28, .09), top=0),
+    Part("box", "statue", "pale", center=(-.8, -.35, .28), half=(.09, .09, .08), top=.09),
+    Part("column", "statue", "copper", center=(-.8, -.35, .48), half=(.07, .07, .12), top=.04),
+    Part("ball", "statue", "copper", center=(-.8, -.35, .64), half=(.055, .055, .055), top=.055),
 ]
-COLUMNS = [
-    Part("column", center=(x, -.34, .47), half=(.062, .062, .27), top=.05, material="pale")
-    for x in np.linspace(-.54, .60, 6)
+TOWN = [
+    Part("ground", "town", "paving", center=(0, 0, 0), half=(2.6, 2.6, 0), top=2.6),
+    Part("ground", "town", "meadow", center=(0, 0, 0), half=(np.inf, np.inf, 0), top=np.inf),
 ]
-HALL = COLUMNS + [
-    Part("box", center=(.03, .2, .53), half=(.59, .26, .33), material="sand"),
-    Part("box", center=(.03, .03, .8), half=(.67, .46, .06), material="pale"),
-    Part("box", center=(.03, .03, .98), half=(.71, .48, .12), top=0, material="tiles"),
-]
-DOME = [
-    Part("column", center=(-.05, .22, 1.07), half=(.33, .33, .17), top=.31, material="sand"),
-    Part("ball", center=(-.05, .22, 1.24), half=(.3, .3, .3), material="copper"),
-    Part("column", center=(-.05, .22, 1.57), half=(.075, .075, .07), top=.065, material="pale"),
-    Part("column", center=(-.05, .22, 1.7), half=(.1, .1, .06), top=.02, material="copper"),
-    Part("ball", center=(-.05, .22, 1.78), half=(.045, .045, .045), material="gold"),
-]
-TOWER = [
-    Part("box", center=(.87, .18, .53), half=(.17, .17, .53), material="brick"),
-    Part("box", center=(.87, .18, 1.1), half=(.2, .2, .04), material="pale"),
-    Part("column", center=(.87, .18, 1.32), half=(.2, .2, .18), top=0, material="slate"),
-]
-ANNEX = [
-    Part("box", center=(-.76, .24, .38), half=(.19, .25, .18), material="brick"),
-    Part("box", center=(-.76, .24, .65), half=(.23, .28, .09), top=0, material="slate"),
-]
-STATUE = [
-    Part("box", center=(-.8, -.35, .28), half=(.09, .09, .08), material="pale"),
-    Part("column", center=(-.8, -.35, .48), half=(.07, .07, .12), top=.04, material="copper"),
-    Part("ball", center=(-.8, -.35, .64), half=(.055, .055, .055), material="copper"),
-]
-# Houses around: x, y, half width, half height; a tree stands before each.
-HOUSES = [
+for x, y, wide, tall in [  # a house: half width, half height; a tree stands before it
     (-7.5, 2, .6, .75), (-6.2, 4.4, .5, .55), (-4, 6.4, .8, .9), (-1.2, 7.6, .5, 1.15),
     (2, 6.8, .7, .7), (4.6, 5.6, .5, .95), (6.8, 3, .6, .65), (7.4, 0, .5, .85),
-]
-TOWN = [Part("ground", center=(0, 0, 0), half=(1, 1, 1), material="paving")]
-for x, y, wide, tall in HOUSES:
+]:
+    roof = (x, y, 2 * tall + .25)
     crown = 0.8 * wide
+    tree = (.8 * x + 1, .7 * y, crown + .2)
     TOWN += [
-        Part("box", center=(x, y, tall), half=(wide, wide, tall), material="plaster"),
-        Part("box", center=(x, y, 2 * tall + .25), half=(wide, wide, .25), top=0, material="slate"),
-        Part("ball", center=(.8 * x + 1, .7 * y, crown + .2), half=[crown] * 3, material="leaf"),
-    ]
-
-
-def stretch(rng, parts):
-    """Parts that stand on each other, in random proportions and moved a little."""
-    size = rng.uniform(0.7, 1.2, 3)
-    shift = np.append(rng.uniform(-0.06, 0.06, 2), 0)
-    foot = np.mean([part.center for part in parts], axis=0)
-    foot[2] = parts[0].center[2] - parts[0].half[2]
-
-    def stretched(part):
-        grow = size if part.shape == "box" else size[[2, 2, 2]]  # others stay round
-        return part._replace(
-            center=foot + (part.center - foot) * size + shift,
-            half=part.half * grow,
-            top=part.widths[1] * grow[0])
-    return [stretched(part) for part in parts]
-
-
-def toy_landmark(number):
-    """The parts of a landmark; every number is another building."""
-    if number == 0:
-        return PLINTH + HALL + DOME + TOWER + ANNEX + STATUE
-    rng = np.random.default_rng([number, 1])
-    hall = stretch(rng, HALL + DOME)
-    parts = PLINTH + hall[:len(HALL)]
-    for group in (hall[len(HALL):], TOWER, ANNEX, STATUE):  # the dome for the second time
-        parts += stretch(rng, group)
-    mirror = np.array([rng.choice((-1, 1)), 1, 1])
-    material = {"gold": "gold"}
-    for names in INTERCHANGEABLE:
-        material |= dict(zip(names, rng.permutation(names)))
-    return [
-        part._replace(center=part.center * mirror, material=material[part.material])
-        for part in parts
+        Part("box", "town", "plaster", center=(x, y, tall), half=(wide, wide, tall), top=wide),
+        Part("box", "town", "slate", center=roof, half=(wide, wide, .25), top=0),
+        Part("ball", "town", "leaf", center=tree, half=(crown, crown, crown), top=crown),
     ]
 
 
 def toy_parts(landmark, background=True):
-    """The parts of a landmark, with the town around it unless the background is off."""
-    return toy_landmark(landmark) + (TOWN if background else [])
+    """The parts of a landmark, every number another building, and of the town around."""
+    town = TOWN if background else []
+    if landmark == 0:
+        return LANDMARK + town
+    rng = np.random.default_rng([landmark, 1])
+    parts = list(LANDMARK)
+    # Random proportions, moved a little; the dome also with the hall.
+    for groups in [("hall", "dome"), ("dome",), ("tower",), ("annex",), ("statue",)]:
+        size = rng.uniform(0.7, 1.2, 3)
+        shift = np.append(rng.uniform(-0.06, 0.06, 2), 0)
+        chosen = [i for i, part in enumerate(parts) if part.group in groups]
+        lowest = parts[chosen[0]]
+        foot = np.mean([parts[i].center for i in chosen], axis=0)
+        foot[2] = lowest.center[2] - lowest.half[2]
+        for i in chosen:
+            part = parts[i]
+            grow = size if part.shape == "box" else size[[2, 2, 2]]  # others stay round
+            parts[i] = part._replace(
+                center=foot + (part.center - foot) * size + shift,
+                half=part.half * grow,
+                top=part.top * grow[0])
+    mirror = np.array([rng.choice((-1, 1)), 1, 1])
+    material = {"gold": "gold"}
+    for names in INTERCHANGEABLE:
+        material |= dict(zip(names, rng.permutation(names)))
+    parts = [
+        part._replace(center=part.center * mirror, material=material[part.material])
+        for part in parts
+    ]
+    return parts + town
 
 
 def part_sdf(part, x):
     """Signed distance to a part, + and exact outside. (P,3) -> (P,)"""
     x, y, z = (x - part.center).T
     if part.shape == "ground":
-        return z
+        return z  # as if it had no edge: there is ground all around
     if part.shape == "ball":
         return np.hypot(np.hypot(x, y), z) - part.half[0]
-    # Distance d to the profile, a trapezoid in (u, z).
-    # u is the horizontal distance from the axis, for a box |x|.
+    # Distance d to the profile, a trapezoid in (u, z). u: from the axis, for a box |x|.
     u = abs(x) if part.shape == "box" else np.hypot(x, y)
-    bottom, top = part.widths
-    _, half_depth, half_height = part.half
-    slant = top - bottom
+    bottom, half_depth, half_height = part.half
+    slant = part.top - bottom
     height = 2 * half_height
     k = ((u - bottom) * slant + (z + half_height) * height) / (slant ** 2 + height ** 2)
     k = np.clip(k, 0, 1)
     side_u = u - bottom - k * slant
     side_z = z + half_height - k * height
-    cap_u = np.maximum(u - np.where(z < 0, bottom, top), 0)
+    cap_u = np.maximum(u - np.where(z < 0, bottom, part.top), 0)
     cap_z = abs(z) - half_height
-    is_inside = (side_u < 0) & (cap_z < 0)
     d = np.minimum(np.hypot(side_u, side_z), np.hypot(cap_u, cap_z))
-    d = np.where(is_inside, -d, d)
+    d = np.where((side_u < 0) & (cap_z < 0), -d, d)
     if part.shape == "column":
         return d
-    # A box extrudes the profile by +-half_depth along y.
-    e = abs(y) - half_depth
+    e = abs(y) - half_depth  # a box extrudes the profile along y
     outside = np.hypot(np.maximum(d, 0), np.maximum(e, 0))
     return outside + np.minimum(np.maximum(d, e), 0)
-
-
-def gradient(sdf, x, step):
-    """Gradient of a distance function at x (P,3), by central differences. -> (P,3)"""
-    rise = [sdf(x + axis) - sdf(x - axis) for axis in step * np.eye(3)]
-    return np.stack(rise, axis=1) / (2 * step)
 
 
 def toy_sdf(x_world, background=True, landmark=0):
@@ -1165,32 +1116,35 @@ def toy_sdf(x_world, background=True, landmark=0):
     return np.min(distances, axis=0) * TOY_SCALE
 
 
+def gradient(sdf, x, step):
+    """Gradient of a distance function at x (P,3), by central differences. -> (P,3)"""
+    rise = [sdf(x + axis) - sdf(x - axis) for axis in step * np.eye(3)]
+    return np.stack(rise, axis=1) / (2 * step)
+
+
 @np.errstate(divide="ignore", invalid="ignore")  # rays that miss, or are parallel
 def intersect_part(part, o, d):
     """Distances at which rays o, d (R,3) enter a part; inf for a miss. -> (R,)
 
-    A part is where a quadric and up to two slabs overlap. The quadric is round in the
-    first n coordinates, and its radius is linear in z: a roof has n = 1 and two slabs,
-    a cone n = 2 and one slab, a ball n = 3. A ray is inside between the last entrance
-    and the first exit.
+    A part is a quadric, round in the first n coordinates, with a radius linear in z; a
+    slab cuts it in each other coordinate. A roof has n = 1, a cone n = 2, a ball n = 3.
     """
     o = o - part.center
     if part.shape == "ground":
-        return np.where(d[:, 2] < -1e-3, -o[:, 2] / d[:, 2], np.inf)
+        t = -o[:, 2] / d[:, 2]
+        from_center = lengths((o + t[:, None] * d)[:, :2])
+        return np.where((d[:, 2] < -1e-3) & (from_center < part.half[0]), t, np.inf)
     n = {"box": 1, "column": 2, "ball": 3}[part.shape]
-    bottom, top = part.widths
-    slope = (top - bottom) / part.half[2] / 2
+    slope = (part.top - part.half[0]) / part.half[2] / 2
     rise = slope * d[:, 2]
-    radius = (bottom + top) / 2 + slope * o[:, 2]  # where the ray starts
+    radius = (part.half[0] + part.top) / 2 + slope * o[:, 2]  # where the ray starts
     a = (d[:, :n] ** 2).sum(1) - rise ** 2
     b = (d[:, :n] * o[:, :n]).sum(1) - rise * radius
     c = (o[:, :n] ** 2).sum(1) - radius * radius
     root = np.sqrt(b * b - a * c)  # nan for a miss
-    enter = (-b - root) / a
-    leave = (-b + root) / a
-    is_steep = a < 0  # steeper than the cone: inside on one end, for ever
-    enter = np.where(is_steep & (rise < 0), -np.inf, enter)
-    leave = np.where(is_steep & (rise > 0), np.inf, leave)
+    # With a < 0 a ray is steeper than the cone: inside on one end, for ever.
+    enter = np.where((a < 0) & (rise < 0), -np.inf, (-b - root) / a)
+    leave = np.where((a < 0) & (rise > 0), np.inf, (-b + root) / a)
     for axis in range(n, 3):
         middle = -o[:, axis] / d[:, axis]
         reach = abs(part.half[axis] / d[:, axis])
@@ -1200,71 +1154,56 @@ def intersect_part(part, o, d):
 
 
 def trace(o, d, parts):
-    """First hits of rays from o (R,3) or (1,3) along d (R,3) or (1,3).
-
-    -> distance (R,), inf is sky, and number of the part (R,)
-    """
+    """First hits of rays o, d (R,3) or (1,3) -> distance, inf is sky; part's number (R,)"""
     enter = np.stack([intersect_part(part, o, d) for part in parts])
     return enter.min(0), enter.argmin(0)
 
 
 def sky_color(d, weather):
-    """Linear colour of the sky and two ranges of hills. d (R,3) -> (R,3)
-
-    weather (4,): RGB tint and cloud phase, each in -sky..sky of make_toy.
-    """
+    """Linear colour of the sky and two ranges of hills. d (R,3) -> (R,3)"""
     up = d[:, 2:]
     azimuth = np.arctan2(d[:, :1], d[:, 1:2])
     *tint, phase = weather
     cloud = np.sin(5 * azimuth + 9 * phase) * np.sin(12 * up + 7 * phase)
     color = (0.58, 0.68, 0.78) - np.clip(up * 1.5, 0, 1) * (0.52, 0.46, 0.26)
-    color = color + 0.4 * np.array(tint) + 0.5 * abs(phase) * np.maximum(cloud, 0)
+    color += 0.4 * np.array(tint) + 0.5 * abs(phase) * np.maximum(cloud, 0)
     for height, amplitude, waves, hill in [
         (0.11, 0.045, 5, (0.25, 0.33, 0.45)),
         (0.06, 0.03, 9, (0.11, 0.18, 0.16)),
     ]:
-        ridge = np.sin(waves * azimuth + height * 40)
-        ridge = ridge + 0.6 * np.sin(2.3 * waves * azimuth)
+        ridge = np.sin(waves * azimuth + height * 40) + 0.6 * np.sin(2.3 * waves * azimuth)
         color = np.where(up < height + amplitude * ridge, hill, color)
     return color
 
 
-def texture(name, across, up):
-    """Colours of a material's cells at two coordinates (P,) on a surface. -> (P,3)
-
-    across is an angle on round parts, up the height.
-    """
-    color, (width, height), contrast, has_windows = MATERIALS[name]
+def surface_color(part, x):
+    """Linear colours at points on a part: stones, or walls with windows. (P,3) -> (P,3)"""
+    x, y, z = x.T
+    across, up = x + y, z
+    if part.shape == "ground":
+        across, up = x, y
+    elif part.shape != "box":
+        across = np.arctan2(y - part.center[1], x - part.center[0])  # the angle
+    color, (width, height), contrast = MATERIALS[part.material]
     row = up / height
     column = across / width
-    if not has_windows:
-        column = column + np.floor(row) % 2 / 2  # every other row of stones is shifted
+    if part.material in WITH_WINDOWS:
+        is_window = (abs(column % 1 - 0.5) < 0.2) & (abs(row % 1 - 0.45) < 0.28)
+    else:
+        is_window = False
+        column += np.floor(row) % 2 / 2  # every other row of stones is shifted
     # A random number per cell: the hash by a sine that shaders use.
     chance = np.sin(12.9898 * np.floor(column) + 78.233 * np.floor(row))
     chance = abs(chance) * 437.585 % 1
-    brightness = 1 + contrast * (2 * chance - 1)
-    if has_windows:
-        is_window = (abs(column % 1 - 0.5) < 0.2) & (abs(row % 1 - 0.45) < 0.28)
-        brightness = brightness * (1 - 0.8 * is_window)
+    brightness = (1 + contrast * (2 * chance - 1)) * np.where(is_window, 0.2, 1)
     return color * brightness[:, None]
 
 
-def surface_color(part, x):
-    """Colours at points on a part's surface. (P,3) -> (P,3)"""
-    x, y, z = x.T
-    if part.shape == "ground":
-        is_paved = np.hypot(x, y)[:, None] < 2.6
-        return np.where(is_paved, texture("paving", x, y), texture("meadow", x, y))
-    across = x + y
-    if part.shape != "box":
-        across = np.arctan2(y - part.center[1], x - part.center[0])  # the angle
-    return texture(part.material, across, z)
-
-
 def shade(o, d, parts, background, sun, weather):
-    """Linear colours along rays: sun, shadow, light of the sky, haze.
+    """Linear colours along rays, in 0..1: sun, shadow, light of the sky, haze.
 
-    o (1,3), d (R,3), sun (3,), weather (4,) -> (R,3)
+    o (1,3), d (R,3), sun (3,) -> (R,3)
+    weather (4,): RGB tint of the sky and cloud phase, each in -sky..sky of make_toy.
     """
     color = sky_color(d, weather) * background
     t, which = trace(o, d, parts)
@@ -1283,18 +1222,7 @@ def shade(o, d, parts, background, sun, weather):
     light += (0.20 + 0.10 * normal[:, 2:]) * (0.8, 0.92, 1.15)
     clear = np.exp(-np.maximum(t - 5, 0) / 20)
     color[hit] = clear * surface * light + (1 - clear) * (0.42, 0.50, 0.58)
-    return color
-
-
-def render(camera, parts, background, sun, weather):
-    """Linear colours of a photo, the mean of four rays a pixel. -> (h*w,3) in 0..1"""
-    _, c2w, _, _ = camera
-    samples = []
-    for offset in itertools.product((0.25, 0.75), repeat=2):  # places in a pixel
-        d = ray_directions(*camera, offset)
-        color = shade(c2w[None, :, 3], d, parts, background, sun, weather)
-        samples.append(np.clip(color, 0, 1))
-    return np.mean(samples, axis=0)
+    return np.clip(color, 0, 1)
 
 
 def toy_camera(rng, azimuth, size):
@@ -1312,20 +1240,12 @@ def toy_camera(rng, azimuth, size):
     away = away * f / min(w, h) * rng.uniform(2.0, 2.6)
     place = target + away * rng.choice((0.8, 1), p=(0.1, 0.9))  # one in ten stands closer
     place[2] = max(place[2], 0.2)
-    z = unit(target - place)
-    x = unit(np.cross(z, (*rng.normal(0, 0.03, 2), 1)))  # hardly anyone holds it level
+    z = target - place
+    z /= np.linalg.norm(z)
+    x = np.cross(z, (*rng.normal(0, 0.03, 2), 1))  # hardly anyone holds it level
+    x /= np.linalg.norm(x)
     c2w = np.stack([x, np.cross(z, x), z, place], 1)
     return (f, f, w / 2, h / 2), c2w, w, h
-
-
-# The strokes of a passer-by: from x y, to x y, width, in heights above the feet; colour.
-# Each covers part of those before it.
-STROKES = [
-    *[((x, 0.03), (x, 0.45), 0.10, "legs") for x in (-0.06, 0.06)],
-    *[((-0.05, y), (0.05, y), 0.16, name) for y, name in [
-        (0.50, "coat"), (0.56, "stripe"), (0.62, "coat"), (0.68, "stripe"), (0.74, "coat")]],
-    ((0, 0.92), (0, 0.92), 0.15, "skin"),
-]
 
 
 def draw_people(rng, w, h, share):
@@ -1341,56 +1261,50 @@ def draw_people(rng, w, h, share):
         coat, legs, thing, skin = 0.02 + 0.83 * rng.beta(0.4, 0.4, (4, 3))
         skin = (0.3 + skin[:1]) * (0.8, 0.6, 0.45)
         stripe = thing if rng.random() < 0.4 else coat
-        colors = dict(coat=coat, legs=legs, thing=thing, skin=skin, stripe=stripe)
+        stripes = zip((0.50, 0.56, 0.62, 0.68, 0.74), (coat, stripe, coat, stripe, coat))
         hand = rng.uniform((-0.25, 0.5), (0.25, 1.15))  # holds a bag, balloon or hat
         tip = hand + rng.uniform(-0.15, 0.15, 2)
-        strokes = [*STROKES, (hand, tip, rng.uniform(0.08, 0.25), "thing")]
-        for begin, end, width, color in strokes:
+        # From x y, to x y, width, in heights above the feet. Each covers those before it.
+        for begin, end, width, color in [
+            *[((x, 0.03), (x, 0.45), 0.10, legs) for x in (-0.06, 0.06)],
+            *[((-0.05, y), (0.05, y), 0.16, color) for y, color in stripes],
+            ((0, 0.92), (0, 0.92), 0.15, skin),
+            (hand, tip, rng.uniform(0.08, 0.25), thing),
+        ]:
             ends = feet + np.array([begin, end]) * (height, -height)
-            rgba = (*colors[color].tolist(), 1)
-            cv2.line(canvas, *ends.astype(int), rgba, int(width * height) + 1)
+            cv2.line(canvas, *ends.astype(int), (*color, 1), int(width * height) + 1)
         left = share - canvas[..., 3].mean()
     small = cv2.resize(canvas, (w, h), interpolation=cv2.INTER_AREA)
     return small.reshape(-1, 4).astype(float)
 
 
-def develop(rng, linear, exposure):
-    """Applies a random exposure, white balance and contrast. linear (P,3) -> uint8 (P,3)"""
-    brightness, red, blue, contrast = exposure * rng.uniform(-1, 1, 4)
-    gain = 2 ** (brightness / 2) * np.array([1 + 0.1 * red, 1, 1 + 0.1 * blue])
-    srgb = np.clip(linear * gain, 0, 1) ** (1.2 ** contrast / 2.2)
-    return (srgb * 255 + 0.5).astype(np.uint8)
-
-
-def toy_points(rng, cameras, depth, surface, occluder):
+def toy_points(rng, cameras, surface, seen):
     """Points as by SfM, noisy and 1.5 % of them wrong, from lists with an item a photo.
 
-    cameras: K, c2w, width, height; depth (h*w,); surface (h*w,3); occluder (h*w,) bool
+    cameras: K, c2w, width, height; surface (h*w,3); its distance (h*w,), inf at people
     -> points (P,5) and tracks, as in build_scene
     """
     samples = []
     count = 3000 // len(cameras)
-    for x, t, people in zip(surface, depth, occluder):
-        ok = (t < 30) & ~people
+    for x, t in zip(surface, seen):
         is_near = (abs(x - (0, 0, 1.02)) < (1.3, 1.3, 1)).all(1)  # the landmark
-        for some, n in [(ok & is_near, count), (ok & ~is_near, count // 5)]:
-            if some.any():
-                samples.append(x[rng.choice(np.flatnonzero(some), n)])
+        for some, n in [(is_near, count), (~is_near, count // 5)]:
+            pixels = np.flatnonzero(some & (t < 30))
+            if len(pixels):
+                samples.append(x[rng.choice(pixels, n)])
     x = np.concatenate(samples)
     tracks = []
-    for (K, c2w, *wh), t, people in zip(cameras, depth, occluder):
+    for (K, c2w, *wh), t in zip(cameras, seen):
         uv, distance = project(K, c2w, x)
-        pixel = pixel_index(uv, wh)
-        is_visible = abs(t[pixel] / distance - 1) < 0.02
-        is_visible &= is_in_photo(uv, wh) & ~people[pixel]
+        is_near = abs(t[pixel_index(uv, wh)] / distance - 1) < 0.02
         is_found = rng.random(len(x)) < 0.6
-        tracks.append(np.flatnonzero(is_visible & is_found))
+        tracks.append(np.flatnonzero(is_in_photo(uv, wh) & is_near & is_found))
     is_wrong = rng.random((len(x), 1)) < 0.015
     x += is_wrong * rng.uniform(-1, 1, x.shape)
     x += rng.normal(0, 0.005, x.shape)
     error = np.zeros(len(x))
     track_length = np.bincount(np.concatenate(tracks), minlength=len(x))
-    return np.column_stack([to_world(x), error, track_length]), tracks
+    return np.column_stack([x * TOY_SCALE + TOY_ORIGIN, error, track_length]), tracks
 
 
 def add_pose_noise(rng, K, c2w, pixels):
@@ -1417,13 +1331,12 @@ def make_toy(seed=0, size=96, photos=48, test=8, occluders=0.05, exposure=1.0,
     sky: how much its colour and clouds differ from photo to photo, 0 to 1
     """
     info = dict(locals(), scene="toy", kind="toy", downscale=1, folder=None, split=None)
-    is_sound = (
+    check(
         seed >= 0 and size >= 16 and photos >= 4 and test >= 0 and landmark >= 0
         and 0 <= occluders <= 0.6 and 0 <= exposure <= 2 and 0 <= pose_noise < np.inf
-        and 0 <= sun <= 180 and 0 <= sky <= 1)
-    check(is_sound,
-          "occluders in 0..0.6, exposure 0..2, sun 0..180, sky 0..1, size >= 16, "
-          "photos >= 4, others >= 0")
+        and 0 <= sun <= 180 and 0 <= sky <= 1,
+        "occluders in 0..0.6, exposure 0..2, sun 0..180, sky 0..1, size >= 16, "
+        "photos >= 4, others >= 0")
     # A generator per knob: no knob changes another's random numbers.
     camera_rng, exposure_rng, people_rng, sfm_rng, pose_rng, sun_rng, sky_rng = [
         np.random.default_rng([seed, k]) for k in range(7)]
@@ -1431,8 +1344,7 @@ def make_toy(seed=0, size=96, photos=48, test=8, occluders=0.05, exposure=1.0,
     numbers = np.arange(count)
     is_test = np.isin(numbers, (np.arange(test) + 0.5) * count // test)
     azimuth = 200 * (numbers + camera_rng.uniform(0.1, 0.9, count)) / count - 100
-    share = people_rng.gamma(0.8 + 6 * occluders, size=count)  # some photos stay free
-    share = share * ~is_test
+    share = people_rng.gamma(0.8 + 6 * occluders, size=count) * ~is_test
     share = np.minimum(share / share.sum() * photos * occluders, 0.85)
     turn = np.radians(sun_rng.uniform(-sun, sun, count))  # of the sun
     weather = sky_rng.uniform(-sky, sky, (count, 4))
@@ -1441,25 +1353,33 @@ def make_toy(seed=0, size=96, photos=48, test=8, occluders=0.05, exposure=1.0,
     for i in progress(numbers, "drawing photos"):
         camera = toy_camera(camera_rng, np.radians(azimuth[i]), size)
         _, c2w, w, h = camera
+        o = c2w[None, :, 3]
         to_sun = cv2.Rodrigues((0, 0, turn[i]))[0] @ SUN
-        linear = render(camera, parts, background, to_sun, weather[i])
+        samples = []
+        for offset in itertools.product((0.25, 0.75), repeat=2):  # places in a pixel
+            d = ray_directions(*camera, offset)
+            samples.append(shade(o, d, parts, background, to_sun, weather[i]))
         people = draw_people(people_rng, w, h, share[i])
-        linear = linear * (1 - people[:, 3:]) + people[:, :3]
-        image = develop(exposure_rng, linear, exposure).reshape(h, w, 3)
+        linear = np.mean(samples, axis=0) * (1 - people[:, 3:]) + people[:, :3]
+        brightness, red, blue, contrast = exposure * exposure_rng.uniform(-1, 1, 4)
+        gain = 2 ** (brightness / 2) * np.array([1 + 0.1 * red, 1, 1 + 0.1 * blue])
+        srgb = np.clip(linear * gain, 0, 1) ** (1.2 ** contrast / 2.2)
+        image = (srgb * 255 + 0.5).astype(np.uint8).reshape(h, w, 3)
         d = ray_directions(*camera)
-        t, _ = trace(c2w[None, :, 3], d, parts)
-        drawn.append((camera, image, t, c2w[:, 3] + t[:, None] * d, people[:, 3] > 0))
+        t, _ = trace(o, d, parts)
+        drawn.append((camera, image, t, o + t[:, None] * d, people[:, 3] > 0))
     cameras, images, depth, surface, occluder = zip(*drawn)
-    points, tracks = toy_points(sfm_rng, cameras, depth, surface, occluder)
+    seen = [np.where(people, np.inf, t) for people, t in zip(occluder, depth)]
+    points, tracks = toy_points(sfm_rng, cameras, surface, seen)
     K, c2w, _, _ = zip(*cameras)
     for i in numbers:
         add_pose_noise(pose_rng, K[i], c2w[i], pose_noise * (not is_test[i]))
-        c2w[i][:, 3] = to_world(c2w[i][:, 3])
+        c2w[i][:, 3] = c2w[i][:, 3] * TOY_SCALE + TOY_ORIGIN
     signs = np.array(list(itertools.product((-1, 1), repeat=3)))
-    corners = [part.center + part.half * signs for part in toy_landmark(landmark)]
+    corners = [part.center + part.half * signs for part in parts[:len(LANDMARK)]]
     scene = build_scene(
         images, K, c2w, is_test, [f"toy_{i:03d}.png" for i in numbers], points, tracks,
-        info, contain=to_world(np.array(corners)))
+        info, contain=np.array(corners) * TOY_SCALE + TOY_ORIGIN)
     scene["depth"] = np.float16(np.concatenate(depth) * TOY_SCALE / scene["scale"])
     scene["occluder"] = np.concatenate(occluder)
     some = np.concatenate(surface)[::9]  # every ninth pixel; sky is infinite and drops out
@@ -1468,11 +1388,12 @@ def make_toy(seed=0, size=96, photos=48, test=8, occluders=0.05, exposure=1.0,
 
 def surface_truth(scene, surface, background, landmark):
     """OPTIONAL arrays about surfaces, from visible points (P,3) in the toy's units."""
-    def sdf(x):  # (P,3) -> (P,), scene units
-        world = x * scene["scale"] + scene["center"]
-        return toy_sdf(world, background, landmark) / scene["scale"]
+    center, scale = scene["center"], scene["scale"]
 
-    wall = (to_world(surface) - scene["center"]) / scene["scale"]
+    def sdf(x):  # (P,3) -> (P,), scene units
+        return toy_sdf(x * scale + center, background, landmark) / scale
+
+    wall = (surface * TOY_SCALE + TOY_ORIGIN - center) / scale
     wall = wall[lengths(wall) < 0.95]
     normal = gradient(sdf, wall, 0.004)
     is_smooth = abs(lengths(normal) - 1) < 0.01

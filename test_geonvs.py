@@ -1057,8 +1057,8 @@ def scene_sdf(scene, x, **knobs):
 
 @pytest.mark.parametrize("number", [1, 3, 10])
 def test_every_landmark_is_another_building(number):
-    parts = data_prep.toy_landmark(number)
-    first = data_prep.toy_landmark(0)
+    parts = data_prep.toy_parts(number, background=False)
+    first = data_prep.toy_parts(0, background=False)
     shift = [lengths(a.center - np.array(b.center)) for a, b in zip(parts, first)]
     assert max(shift) > .1
     assert [part.material for part in parts] != [part.material for part in first]
@@ -1066,7 +1066,7 @@ def test_every_landmark_is_another_building(number):
 
 @pytest.mark.parametrize("number", [1, 3, 10])
 def test_no_part_hangs_in_the_air(number):
-    parts = data_prep.toy_landmark(number)
+    parts = data_prep.toy_parts(number, background=False)
     for part in parts:
         foot = np.array([part.center]) - [0, 0, part.half[2]]
         others = [other for other in parts + data_prep.TOWN if other is not part]
@@ -1094,7 +1094,7 @@ def test_a_landmark_fills_the_unit_sphere(number):
     ball=("ball", 3, (3, 4, 12), 10))
 def test_distances_to_parts_equal_closed_forms(shape, top, x, distance):
     center = np.array([10, 20, 30])
-    part = data_prep.Part(shape, center, half=(3, 2, 1), material="gold", top=top)
+    part = data_prep.Part(shape, "hall", "gold", center, half=(3, 2, 1), top=top)
     assert_arrays_close(data_prep.part_sdf(part, np.array([center + x])), distance)
 
 
