@@ -3939,14 +3939,14 @@ STRESS = {  # knobs of the toy, the row of PAPER or PIECES that is made for them
     "other building": (dict(photos=24, landmark=3), "no curvature", 1)}
 WIDE = dict(rays=1024, samples=64, hidden=256, lr_net=5e-4)
 LEAN = dict(rays=384, hidden=32, lr_net=1e-2, lr_grid=3e-2)
-SMALL = {  # methods of chart and stress, in sizes that serve the toy best in a minute
+SMALL = {  # methods of chart and stress, as tuned on a toy and a theatre for a minute: see RESULTS
     "geonvsw": Row(LEAN),
     "geonvsw, defaults": Row(),
     "density": Row(LEAN | NO_GEOMETRY, kind=Density),
     "splats": Row(SPLATS, kind=Splats),
     "splats, no mask": Row(SPLATS, kind=PlainSplats),
     "nerfw": Row(
-        dict(rays=256, photos=256, samples=24, hidden=64, lr_net=5e-3),
+        dict(rays=256, photos=256, samples=16, hidden=64, lr_net=5e-3),
         kind=NeRFW),
     "hanerf": Row(
         dict(rays=256, photos=1, samples=16, hidden=64, lr_net=4e-3),
