@@ -1396,7 +1396,7 @@ def restore(saved, model, gen=None):
     """Puts a checkpoint's weights into a model, and its random numbers into gen, which must be of
     the same kind of device; returns its optimiser and State."""
     try:
-        check_same_scene(saved["scene"], scene_facts(model.scene))
+        check_same_scene(dict(saved["scene"]), scene_facts(model.scene))
         for octree, keys in zip(model.octrees, saved["octrees"], strict=True):
             octree.build(keys.to(octree.child.device))
         model.load_state_dict(saved["model"])
