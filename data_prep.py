@@ -4,14 +4,14 @@
     python data_prep.py toy --occluders 0.4     a toy -> data/toy.npz
     python data_prep.py brandenburg --download  Phototourism, 5 GB -> data/brandenburg.npz
     python data_prep.py my_photos --sfm         photos, posed first -> data/my_photos-*.npz
-    python data_prep.py my_scene                photos and a COLMAP model in it -> the same
+    python data_prep.py my_scene                photos and their COLMAP model -> data/my_scene-*.npz
 
 Scene files. A scene is one .npz of the arrays in FORMAT, below; some have those in OPTIONAL.
 The landmark lies in the unit sphere. A ray is c2w[:, 3] + t * d with |d| = 1; a distance
 is this t, never a z-depth. x right, y down, z forward are a camera's axes, as in OpenCV.
 
-Masks. In masks/ beside images/, the mask of photo.jpg is photo.png, photo.jpg.png or
-photo.jpg; its black pixels are left out.
+Masks. masks/ lies in the folder of photos or beside it; there the mask of photo.jpg is
+photo.png, photo.jpg.png or photo.jpg. Pixels darker than 128 are left out.
 
 Functions raise UserError, one sentence that says what to do.
 """
@@ -69,7 +69,7 @@ FORMAT = dict(
     track_uv=("float32", ["observations", 2]),  # (u / w, v / h): 0..1 inside, clipped to -1..2
     center=("float64", [3]),  # SfM units are x * scale + center
     scale=("float64", []),
-    footprint=("float64", []),  # a typical pixel's size on the landmark
+    footprint=("float64", []),  # size of a pixel on the landmark, lower quartile
     exposure_spread=("float64", []),  # between training photos, of brightness in 0..1
     bg_color=("float64", [3]),  # in 0..1, where it is one colour; else NaN
     info=("<U", []),  # JSON: scene, kind (toy or colmap), downscale, folder, split, ...
@@ -109,7 +109,7 @@ def allow_any_character():
 
 
 def progress(items, what):
-    """Yields items; tells how far it is after ten seconds, or a minute in a log file."""
+    """Yields items and prints progress: after 10 s every second, in a log file every minute."""
     is_terminal = sys.stdout.isatty()
     wait = 1 if is_terminal else 60  # seconds
     due = max(10, wait)
@@ -117,11 +117,11 @@ def progress(items, what):
     total = len(items)
     for done, item in enumerate(items, 1):
         yield item
-        past = time.monotonic() - begin
+        elapsed = time.monotonic() - begin
         is_last = done == total
-        if past > due or (is_last and past > 10):
-            due = past + wait
-            left = past / done * (total - done)
+        if elapsed > due or (is_last and elapsed > 10):
+            due = elapsed + wait
+            left = elapsed / done * (total - done)
             line = f"  {what}: {done} of {total}, {left:.0f} s left "
             if is_terminal:
                 line = "\r" + line  # over the one before
@@ -137,8 +137,8 @@ def atomic_write(path, write):
         write(temporary)
         temporary.replace(path)
     except OSError as e:
-        says = f"cannot write {path} ({e.strerror or e}): free or choose a place"
-        raise UserError(says) from e
+        message = f"cannot write {path} ({e.strerror or e}): free or choose a place"
+        raise UserError(message) from e
     finally:
         temporary.unlink(missing_ok=True)
 
@@ -149,7 +149,7 @@ def write_scene(path, scene):
 
 
 def refuse_bomb(path):
-    """UserError for a zip bomb: unpacked larger than the file, which ours never are."""
+    """UserError if the archive unpacks to more bytes than the file has: ours are never packed."""
     with zipfile.ZipFile(path) as file:
         unpacked = sum(member.file_size for member in file.infolist())
     check(unpacked <= os.path.getsize(path), f"{path} is larger inside than outside")
@@ -193,8 +193,8 @@ def read_scene(path):
             scene = dict(file)
         check_scene(scene)
     except Exception as e:  # a damaged file can fail in any layer: zip, header, dtype, text
-        says = f"{path} is no whole scene, or too large: delete it, it is remade"
-        raise UserError(says) from e
+        message = f"{path} is no whole scene, or too large: delete it, it is remade"
+        raise UserError(message) from e
     return scene
 
 
@@ -237,8 +237,9 @@ def find_sphere(x, weight, tracks, is_test, contain):
 
     Centre: geometric median of points x (P,3) by weight. Radius: 1.1 x the distance of
     95 %; if that is a skyline, more than four times the median distance away, only
-    nearer points are counted. Inside are at least 30 % of the points (M,) of most
-    training photos, and contain (...,3).
+    nearer points are counted. At least half of the training photos have 30 % of their
+    points inside. All points contain (...,3) are inside. tracks: for each photo, the
+    indices (M,) of its points.
     """
     center = np.median(x, axis=0)
     for _ in range(20):  # Weiszfeld
@@ -310,7 +311,9 @@ def build_scene(
 
 
 def brightness_spread(points, brightness):
-    """Deviation of photos' brightness at equal points. Lists of (M,), an item a photo."""
+    """How much brightness differs between photos: the standard deviation of each photo's
+    median offset from its points' mean brightness. points, brightness: a (M,) per photo.
+    """
     all_points = np.concatenate(points)
     mean = np.bincount(all_points, np.concatenate(brightness))
     mean /= np.maximum(np.bincount(all_points), 1)  # (P,)
@@ -322,7 +325,7 @@ def brightness_spread(points, brightness):
 
 
 def common_color(colors):
-    """Median of colours uint8 (P,3) in 0..1; NaN unless 60 % are like it. -> (3,)"""
+    """Median of uint8 colours (P,3), scaled to 0..1; NaN unless 60 % lie within 2 % of it."""
     if len(colors) > 100:  # fewer may all be people
         median = np.median(colors, axis=0)
         is_like = (abs(colors - median) < 5.1).all(1)
@@ -334,7 +337,8 @@ def common_color(colors):
 def add_statistics(scene):
     """Adds near, track_uv, footprint, exposure_spread, bg_color.
 
-    near: 0.8 x the 2 % quantile of the distances of a photo's points, >= 0.02.
+    near: 0.8 x the 2 % quantile of the distances of a photo's points, >= 0.02;
+    0.05 without points.
     """
     near, track_uv = [], []
     for i, (K, c2w, wh) in enumerate(zip(scene["K"], scene["c2w"], scene["wh"])):
@@ -352,12 +356,12 @@ def training_statistics(scene):
     """The numbers of FORMAT that come from the training photos, without masked pixels.
 
     footprint: lower quartile of a pixel's size at points in the sphere.
-    exposure_spread: deviation of brightness at equal points.
+    exposure_spread: standard deviation of the photos' brightness at the same points.
     bg_color: seen by rays that miss the sphere, NaN unless 60 % agree.
     """
     rgb = scene["rgb"]
     masked = scene.get("masked", np.zeros(len(rgb), bool))
-    step = max(1, len(rgb) // 500_000)
+    step = max(1, len(rgb) // 500_000)  # large scenes need not every background pixel
     observed, sizes, brightness, background = [], [], [], []
     for i in np.flatnonzero(~scene["is_test"]):
         first, K, c2w, wh = [scene[key][i] for key in ("start", "K", "c2w", "wh")]
@@ -372,9 +376,9 @@ def training_statistics(scene):
         o = c2w[:, 3]
         d = ray_directions(K, c2w, *wh)
         closest = o - np.minimum(d @ o, 0)[:, None] * d  # to the centre, along each ray
-        is_miss = lengths(closest) > 1
-        is_miss &= ~masked[first:first + len(d)]
-        background.append(rgb[first + np.flatnonzero(is_miss)[::step]])
+        is_background = lengths(closest) > 1
+        is_background &= ~masked[first:first + len(d)]
+        background.append(rgb[first + np.flatnonzero(is_background)[::step]])
     return dict(
         footprint=np.quantile(np.concatenate(sizes), 0.25),
         exposure_spread=brightness_spread(observed, brightness),
@@ -418,9 +422,9 @@ def open_binary(path):
         try:
             record = struct.Struct("<" + layout)
             return record.unpack(file.read(record.size))
-        except struct.error as e:  # too few bytes are left, or none could be enough
-            says = f"{path} ends too early: copy it again, or delete its folder"
-            raise UserError(says) from e
+        except struct.error as e:  # too few bytes are left, or the count is absurd
+            message = f"{path} ends too early: copy it again, or delete its folder"
+            raise UserError(message) from e
     return read
 
 
@@ -483,7 +487,7 @@ def check_photo(camera, pose, is_test):
 def camera_to_world(pose):
     """COLMAP's world to camera, quaternion and translation (7,) -> c2w (3,4)"""
     w, *v = pose[:4] / np.linalg.norm(pose[:4])  # old files are not normalised
-    turn = np.cross(v, np.eye(3))
+    turn = np.cross(v, np.eye(3))  # rows v x e_i: [v]x transposed, so that R is camera to world
     R = np.eye(3) + 2 * w * turn + 2 * turn @ turn
     return np.column_stack([R, -R @ pose[4:]])
 
@@ -494,12 +498,12 @@ def read_points(sparse):
     read = open_binary(sparse / "points3D.bin")
     (count,) = read("Q")
     for _ in range(count):
-        key, x, y, z, *_, error, track_length = read("Q3d3BdQ")
+        point_id, x, y, z, *_, error, track_length = read("Q3d3BdQ")
         read(f"{2 * track_length}I")  # the track, skipped: photos list their points
-        rows[key] = len(points)
+        rows[point_id] = len(points)
         points.append((x, y, z, error, track_length))
     points = np.array(points, float).reshape(-1, 5)
-    # Zero track length: build_scene drops them. nan compares as False.
+    # A row with nan or a huge number becomes 0; build_scene drops points of track length 0.
     points[~(abs(points) < MAX_NUMBER).all(1)] = 0
     check((points[:, 4] > 1).any(),
           f"no point of {sparse} has a track: run colmap point_triangulator on it")
@@ -630,9 +634,9 @@ def find_model(folder, command):
     lost = sorted(best.photos.keys() - best.files)
     if lost:
         hint = name_hint(lost[0], best.on_disk)
-        says = f"{len(lost)} photos of {best.sparse} are not on disk, such as {lost[0]!r}{hint}"
-        check(best.files, f"{says}: put them into {folder / 'images'}, or run {command}")
-        warn(says)
+        message = f"{len(lost)} photos of {best.sparse} are not on disk, such as {lost[0]!r}{hint}"
+        check(best.files, f"{message}: put them into {folder / 'images'}, or run {command}")
+        warn(message)
     on_disk = max(len(model.on_disk) for model in models)
     print(f"{best.images}: {on_disk} photos on disk, {len(best.files)} posed by {best.sparse}")
     for model in models:
@@ -689,52 +693,52 @@ def read_split(tables):
         check("filename" in head and "split" in head,
               f"{path} needs a header with filename and split")
         rows = [dict(zip(head, words)) for words in lines]
-    held_out = {}
+    is_held_out = {}
     for row in rows:
         if row.get("id") == "":
             continue
         name = row.get("filename")
         subset = row.get("split")
         is_test = subset == "test"
-        check(name and subset in ("train", "test") and held_out.get(name, is_test) == is_test,
+        check(name and subset in ("train", "test") and is_held_out.get(name, is_test) == is_test,
               f"{path}: {name!r} is {subset!r}; each is train or test, and not both")
-        held_out[name] = is_test
-    return held_out
+        is_held_out[name] = is_test
+    return is_held_out
 
 
-def choose_held_out(folder, names, tables):
+def choose_split(folder, names, tables):
     """{name: whether it is held out} of the photos that are to be used; tells the rule."""
     if not tables:
         print(f"{folder} has no split file: every eighth photo is held out")
         return {name: i % 8 == 7 for i, name in enumerate(names)}
     print(f"split by {tables[0]}")
-    held_out = read_split(tables)
-    matches = match_names(held_out, names)
-    held_out = {matches.get(name, name): is_test for name, is_test in held_out.items()}
-    rest = set(names) - held_out.keys()
+    is_held_out = read_split(tables)
+    matches = match_names(is_held_out, names)
+    is_held_out = {matches.get(name, name): is_test for name, is_test in is_held_out.items()}
+    rest = set(names) - is_held_out.keys()
     if rest:
         warn(f"{len(rest)} photos are not in {tables[0]}: {min(rest)} ...")
-    return held_out
+    return is_held_out
 
 
 # ---- checksums -------------------------------------------------------------------------
-def checksum(paths, start=0):
+def checksum(paths, crc=0):
     """CRC-32 over the content of the files that exist."""
     for path in paths:
         if path.is_file():
-            start = zlib.crc32(path.read_bytes(), start)
-    return start
+            crc = zlib.crc32(path.read_bytes(), crc)
+    return crc
 
 
-def photos_checksum(files, masks, start=0):
+def photos_checksum(files, masks, crc=0):
     """CRC-32 over the photos' names and content and their masks. files, masks: {name: path}"""
     for name in sorted(files):
-        start = zlib.crc32(os.fsencode(name), start)
+        crc = zlib.crc32(os.fsencode(name), crc)
         paths = [files[name]]
         if name in masks:
             paths.append(masks[name])
-        start = checksum(paths, start)
-    return start
+        crc = checksum(paths, crc)
+    return crc
 
 
 def fingerprint(info):
@@ -750,8 +754,8 @@ def fingerprint(info):
     files = {
         name: there[other] for name, other in match_names(info["posed"], there).items()}
     masks = mask_files(images, files)
-    start = checksum([*models, *split_files(folder, info["split"])])
-    return photos_checksum(files, masks, start)
+    crc = checksum([*models, *split_files(folder, info["split"])])
+    return photos_checksum(files, masks, crc)
 
 
 def is_fresh(info):
@@ -793,7 +797,8 @@ def undistort(image, camera):
         return image, K
     fx, fy, cx, cy = K - (0, 0, 0.5, 0.5)  # OpenCV's first pixel is at 0
     M = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-    P, _ = cv2.getOptimalNewCameraMatrix(M, distortion, wh, 0)  # 0: nothing but photo
+    # alpha = 0: every pixel lies in the photo
+    P, _ = cv2.getOptimalNewCameraMatrix(M, distortion, wh, 0)
     image = cv2.undistort(image, M, distortion, None, P)
     return image, np.array([P[0, 0], P[1, 1], P[0, 2] + 0.5, P[1, 2] + 0.5])
 
@@ -820,7 +825,8 @@ def read_photo(path, camera, downscale):
     image, K = undistort(image, camera)
     small = w // downscale, h // downscale
     image = cv2.resize(image, small, interpolation=cv2.INTER_AREA)
-    return image[..., ::-1], K * (small * 2) / (w, h, w, h)
+    shrink = np.divide(small, (w, h))
+    return image[..., ::-1], K * np.tile(shrink, 2)  # fx, cx by width; fy, cy by height
 
 
 def read_mask(path, size):
@@ -865,19 +871,19 @@ def read_masks(model, usable):
 
 
 # ---- prepare ---------------------------------------------------------------------------
-def read_usable(model, points, rows, held_out, downscale):
+def read_usable(model, points, rows, is_held_out, downscale):
     """{name: (rgb, K, c2w, rows of its points)} of the photos that can be used.
 
     Tells which cannot, and why.
     """
     usable = {}
     misfits = {}  # photos that miss most of the points that they should see
-    for name in progress(sorted(held_out), "preparing photos"):
+    for name in progress(sorted(is_held_out), "preparing photos"):
         try:
             check(name in model.photos, f"has no pose{name_hint(name, model.files)}")
             check(name in model.files, f"is not on disk{name_hint(name, model.on_disk)}")
             camera, pose, ids = model.photos[name]
-            check_photo(camera, pose, held_out[name])
+            check_photo(camera, pose, is_held_out[name])
             image, K = read_photo(model.files[name], camera, downscale)
         except UserError as e:
             warn(f"left out: {name} {e}")
@@ -896,10 +902,10 @@ def read_usable(model, points, rows, held_out, downscale):
         warn(f"left out: {name} shows {share:.0%} of its points: its pose or its distortion "
              "is wrong")
         del usable[name]
-    lost = [name for name in held_out if held_out[name] and name not in usable]
+    lost = [name for name in is_held_out if is_held_out[name] and name not in usable]
     check(not lost,
           f"held-out photos cannot be used, repair them or hold out others: {lost}")
-    count = sum(not held_out[name] for name in usable)
+    count = sum(not is_held_out[name] for name in usable)
     check(count >= 2,
           f"{count} usable training photos are too few: repair them or the split file")
     return usable
@@ -926,12 +932,12 @@ def prepare(name, downscale=2, split=None):
         split=split)
     info["files"] = fingerprint(info)
     tables = split_files(folder, split)
-    held_out = choose_held_out(folder, sorted(model.files), tables)
+    is_held_out = choose_split(folder, sorted(model.files), tables)
     points, rows = read_points(model.sparse)
-    usable = read_usable(model, points, rows, held_out, downscale)
+    usable = read_usable(model, points, rows, is_held_out, downscale)
     masks = read_masks(model, usable)
     images, K, c2w, tracks = zip(*usable.values())
-    is_test = [held_out[name] for name in usable]
+    is_test = [is_held_out[name] for name in usable]
     scene = build_scene(
         images, K, c2w, is_test, list(usable), points, tracks, info, masks=masks)
     spread = [
@@ -947,7 +953,7 @@ def prepare(name, downscale=2, split=None):
 
 
 def scene_path(name_or_folder):
-    """data/<scene>.npz; of two folders with one name each has its own."""
+    """data/<scene>.npz; folders get a suffix, so that two of one name do not share a file."""
     folder = Path(name_or_folder).resolve()
     mark = ""
     if name_or_folder not in ("toy", *SCENES):
@@ -1005,7 +1011,7 @@ class Part(NamedTuple):
     group: str  # parts that stand on each other
     material: str
     center: tuple
-    half: tuple  # half width at the bottom, depth and height; a width is also a radius
+    half: tuple  # half width (or radius) at the bottom, half depth, half height
     top: float  # half width at the top
 
 
@@ -1095,7 +1101,7 @@ def part_sdf(part, x):
     slant = part.top - bottom
     height = 2 * half_height
     k = ((u - bottom) * slant + (z + half_height) * height) / (slant ** 2 + height ** 2)
-    k = np.clip(k, 0, 1)
+    k = np.clip(k, 0, 1)  # the nearest point of the side: 0 at the bottom, 1 at the top
     side_u = u - bottom - k * slant
     side_z = z + half_height - k * height
     cap_u = np.maximum(u - np.where(z < 0, bottom, part.top), 0)
@@ -1141,8 +1147,8 @@ def intersect_part(part, o, d):
     a = (d[:, :n] ** 2).sum(1) - rise ** 2
     b = (d[:, :n] * o[:, :n]).sum(1) - rise * radius
     c = (o[:, :n] ** 2).sum(1) - radius * radius
-    root = np.sqrt(b * b - a * c)  # nan for a miss
-    # With a < 0 a ray is steeper than the cone: inside on one end, for ever.
+    root = np.sqrt(b * b - a * c)  # inside where a t^2 + 2 b t + c < 0; nan for a miss
+    # a < 0: the radius grows faster than the ray leaves the axis: one end stays inside.
     enter = np.where((a < 0) & (rise < 0), -np.inf, (-b - root) / a)
     leave = np.where((a < 0) & (rise > 0), np.inf, (-b + root) / a)
     for axis in range(n, 3):
@@ -1281,14 +1287,15 @@ def draw_people(rng, w, h, share):
 def toy_points(rng, cameras, surface, seen):
     """Points as by SfM, noisy and 1.5 % of them wrong, from lists with an item a photo.
 
-    cameras: K, c2w, width, height; surface (h*w,3); its distance (h*w,), inf at people
+    cameras: K, c2w, width, height; surface: points (h*w,3) that the pixels see; seen:
+    their distances (h*w,), inf where a person is in front
     -> points (P,5) and tracks, as in build_scene
     """
     samples = []
     count = 3000 // len(cameras)
     for x, t in zip(surface, seen):
-        is_near = (abs(x - (0, 0, 1.02)) < (1.3, 1.3, 1)).all(1)  # the landmark
-        for some, n in [(is_near, count), (~is_near, count // 5)]:
+        is_landmark = (abs(x - (0, 0, 1.02)) < (1.3, 1.3, 1)).all(1)
+        for some, n in [(is_landmark, count), (~is_landmark, count // 5)]:
             pixels = np.flatnonzero(some & (t < 30))
             if len(pixels):
                 samples.append(x[rng.choice(pixels, n)])
@@ -1296,9 +1303,9 @@ def toy_points(rng, cameras, surface, seen):
     tracks = []
     for (K, c2w, *wh), t in zip(cameras, seen):
         uv, distance = project(K, c2w, x)
-        is_near = abs(t[pixel_index(uv, wh)] / distance - 1) < 0.02
+        is_visible = abs(t[pixel_index(uv, wh)] / distance - 1) < 0.02
         is_found = rng.random(len(x)) < 0.6
-        tracks.append(np.flatnonzero(is_in_photo(uv, wh) & is_near & is_found))
+        tracks.append(np.flatnonzero(is_in_photo(uv, wh) & is_visible & is_found))
     is_wrong = rng.random((len(x), 1)) < 0.015
     x += is_wrong * rng.uniform(-1, 1, x.shape)
     x += rng.normal(0, 0.005, x.shape)
@@ -1308,7 +1315,7 @@ def toy_points(rng, cameras, surface, seen):
 
 
 def add_pose_noise(rng, K, c2w, pixels):
-    """Turns and moves c2w, in the toy's units, by `pixels` rms at the landmark."""
+    """Turns and moves c2w in place, in the toy's units, by `pixels` rms at the landmark."""
     # [rad]: rotation and shift in two axes each, so that 4 (pixels / 2)^2 = pixels^2.
     *turn, dx, dy = rng.normal(0, pixels / 2, 4) / K[0]
     c2w[:, 3] += c2w[:, :2] @ (dx, dy) * np.linalg.norm(c2w[:, 3])
@@ -1321,6 +1328,7 @@ def make_toy(seed=0, size=96, photos=48, test=8, occluders=0.05, exposure=1.0,
 
     `seed` changes cameras, people and noise; only `landmark` changes the building.
 
+    photos, test: number of training photos and of held-out photos
     size: long side of a photo [px]
     occluders: mean share of a training photo that people cover, 0 to 0.6
     exposure: spread of brightness, white balance and contrast; 1 as of tourists, 0 to 2
@@ -1337,7 +1345,7 @@ def make_toy(seed=0, size=96, photos=48, test=8, occluders=0.05, exposure=1.0,
         and 0 <= sun <= 180 and 0 <= sky <= 1,
         "occluders in 0..0.6, exposure 0..2, sun 0..180, sky 0..1, size >= 16, "
         "photos >= 4, others >= 0")
-    # A generator per knob: no knob changes another's random numbers.
+    # A generator per source of randomness: a knob leaves the random numbers of others alone.
     camera_rng, exposure_rng, people_rng, sfm_rng, pose_rng, sun_rng, sky_rng = [
         np.random.default_rng([seed, k]) for k in range(7)]
     count = photos + test
@@ -1435,8 +1443,8 @@ def fetch(folder_url, path):
     except Exception as e:  # of the disk, the network or its protocol
         if getattr(e, "code", 0) == 416:  # longer than the file itself
             partial.unlink()
-        says = f"the download of {url} broke ({e}); the same command continues it"
-        raise UserError(says) from e
+        message = f"the download of {url} broke ({e}); the same command continues it"
+        raise UserError(message) from e
 
 
 def unpack(archive, wanted, folder):
@@ -1466,8 +1474,8 @@ def download(name):
             shutil.copy(split, unpacked / split.name)
             unpacked.replace(folder)
     except Exception as e:  # a damaged archive can fail in any layer
-        says = f"cannot unpack {archive} ({e}): free space, or delete it and retry"
-        raise UserError(says) from e
+        message = f"cannot unpack {archive} ({e}): free space, or delete it and retry"
+        raise UserError(message) from e
 
 
 def sfm_photos(images):

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Part I: tests, in the order of data_prep.py and geonvs.py. Part II: rivals and experiments.
 
-The tests come from properties: plain loops in float64, closed forms, limits, invariances, round
+Tests check properties: against plain loops in float64, closed forms, limits, invariances, round
 trips. Nothing needs data, network or a GPU, nothing is skipped, and no timing decides.
 """
 import contextlib
@@ -286,7 +286,7 @@ def scene_of_points(
     if tracks is None:
         tracks = [np.arange(len(xyz))] * 3
     images = np.zeros((3, size, size, 3), np.uint8)
-    K = np.full((3, 4), 20)
+    K = np.full((3, 4), 20)  # f = cx = cy = 20: the axis meets a corner of a 20 px photo
     c2w = [np.eye(3, 4)] * 3
     zero = np.zeros(len(xyz))
     points = np.column_stack([xyz, zero + error, zero + views])
