@@ -1884,8 +1884,10 @@ def test_a_scene_gets_the_parts_it_needs(settings, facts, wanted):
     assert geonvs.needed_parts(tiny(**settings), facts) == wanted
 
 
-def test_a_model_is_made_of_these_parts(scene, warm):
+def test_a_model_is_made_of_these_parts(scene, warm, monkeypatch):
     bare = make_model(scene, appearance="off", background="off")
+    make_cache = mock.Mock(side_effect=lambda n, make=geonvs.SDFCache: make(8))
+    monkeypatch.setattr(geonvs, "SDFCache", make_cache)
     deep = make_model(scene, levels=5)
     count = deep.background.octree.cells[:, 0].bincount()
     shallow_count = warm.background.octree.cells[:, 0].bincount()
@@ -1896,6 +1898,7 @@ def test_a_model_is_made_of_these_parts(scene, warm):
     assert len(shallow_count) == 3
     assert shallow_count[1] < 64**3
     assert deep.eps == 2 / 16 / 4 / 2  # half of the smallest cell there is
+    make_cache.assert_called_once_with(128)
 
 
 @cases(
