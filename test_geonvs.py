@@ -1917,6 +1917,13 @@ def test_an_automatic_mask_follows_training_photos(
     assert warm.cfg.mask == wanted
 
 
+def test_a_model_starts_as_a_small_sphere(warm):
+    x = 0.57 * random(5000, 3, low=-1)  # a cube in the sphere
+    s = warm.distance(x)
+    assert (s - x.norm(dim=1) + 0.25).square().mean().sqrt() < 0.03
+    assert (warm.cache.sdf(x[None])[0] - s).abs().max() < 0.03
+
+
 @pytest.mark.parametrize("done, floor, share", [
     (0.0, 15.0, 1.0), (0.215, 47.5, 1.0), (0.43, 80.0, 0.23), (1.0, 80.0, 0.23)])
 def test_a_step_bounds_zeta_and_renews_the_cache(warm, done, floor, share):
@@ -2598,13 +2605,15 @@ def test_a_panel_shows_its_columns_in_order(warm, scene, in_tmp_dir, monkeypatch
     warm.mask.logits = lambda photos: torch.full((1, 1, 8, 8), -0.5)
     scene = scene._replace(test=torch.tensor([1, 4, 6]), train=torch.tensor([0, 2, 3]))
     geonvs.write_panel(Path("a.png"), warm, scene, codes)
-    kinds = [call.args[1].split(":")[0] for call in write_text.call_args_list]
+    titles = [call.args[1] for call in write_text.call_args_list]
+    kinds = [title.split(":")[0] for title in titles]
     panel = cv2.imread("a.png")[:, :, ::-1].reshape(4, 380, count, 240, 3)
-    titles, tiles = np.split(panel, [20], axis=1)
+    title_rows, tiles = np.split(panel, [20], axis=1)
     wanted = [[0, 128, 0], [128, 0, 0], [128, 128, 191], [7, 7, 7], [96, 96, 96]]
     assert (tiles == np.array(wanted[:count])[:, None]).all()
     assert kinds == ["held out", "held out", "training", "training"]
-    assert (titles < 50).any((1, 2, 3, 4)).all()  # they are to be seen
+    assert all(("mask" in title) == (mask == "on") for title in titles)
+    assert (title_rows < 50).any((1, 2, 3, 4)).all()  # they are to be seen
 
 
 def test_a_film_sways_and_changes_its_light(warm, odd, in_tmp_dir, monkeypatch):
