@@ -3680,7 +3680,7 @@ def write_table(path, table):
 
 
 def draw_chart(table):
-    """PSNR over what it cost, a curve for each method; the first is thick, as others may hide it."""
+    """PSNR over what it cost, a curve a method; the first is thick, as others may hide it."""
     from matplotlib import figure as figures
     costs = [unit for unit in COSTS if any(line[unit] for line in table)]
     methods = list(dict.fromkeys(map(method_of, table)))
