@@ -3977,5 +3977,21 @@ def test_the_time_to_a_level_is_interpolated_between_whole_runs():
     assert time_to(lines, 20, "seconds") is None
 
 
+def test_a_chart_draws_each_method_over_its_cost_and_the_baseline():
+    costs, values = [15.0, 60.0], {"ours": [20.0, 24.0], "theirs": [22.0, 23.0]}
+    table = []
+    for method, curve in values.items():
+        for cost, psnr in zip(costs, curve):
+            table.append(dict(row=f"{method} x{cost}", train_seconds=cost, energy_wh=None,
+                              psnr=psnr, psnr_std=0.5, psnr_floor=16.0))
+    axis, = draw_chart(table).axes
+    curves = {curve.get_label(): curve.lines[0].get_xydata() for curve in axis.containers}
+    assert set(curves) == set(values)
+    for method, curve in values.items():
+        np.testing.assert_array_equal(curves[method], np.stack([costs, curve], 1))
+    baseline, = [line for line in axis.lines if line.get_label() == "baseline"]
+    assert set(baseline.get_ydata()) == {16.0}
+
+
 if __name__ == "__main__":
     geonvs.run_command_line(lambda: experiment(sys.argv[1:]))
