@@ -3702,26 +3702,47 @@ def draw_chart(table):
     return figure
 
 
-def draw_bars(table, is_stress):
-    """What each row gains over the first row, the best one last; in `stress` over the row
-    means of the left half, coloured by method."""
+def draw_bars(table):
+    """What each row gains over the first row, the best one last."""
     from matplotlib import figure as figures
     rows = [line for line in table if line["psnr"]]
-    if not is_stress:
-        rows.sort(key=lambda line: line["psnr"])
-    colours = dict(full="C0", nerfw="C1", hanerf="C2", splats="C3", density="C4")
+    rows.sort(key=lambda line: line["psnr"])
     figure = figures.Figure(figsize=(7.5, 1 + 0.25 * len(rows)), layout="constrained")
     axis = figure.subplots()
-    base = "the baseline" if is_stress else "the first row"
     for place, line in enumerate(rows):
-        gain = line["psnr"] - (line["psnr_floor"] if is_stress else table[0]["psnr"])
-        colour = colours.get(line["row"].split(": ")[-1], "C9")
-        axis.barh(place, gain, xerr=line["psnr_std"] or 0, capsize=3, color=colour)
-    names = [f"{line['row']} ({line['failures']} of {line['runs']} failed)" for line in rows]
-    axis.set_yticks(range(len(rows)), names)
+        gain = line["psnr"] - table[0]["psnr"]
+        axis.barh(place, gain, xerr=line["psnr_std"] or 0, capsize=3, color="C0")
+    axis.set_yticks(range(len(rows)), [line["row"] for line in rows])
     axis.invert_yaxis()
     axis.axvline(0, color="grey", lw=1)
-    axis.set_xlabel(f"PSNR above {base} ({table[0]['row']}: {table[0]['psnr']:.2f}), dB")
+    axis.set_xlabel(f"PSNR above the first row ({table[0]['row']}: {table[0]['psnr']:.2f}), dB")
+    return figure
+
+
+def draw_cells(table):
+    """In each cell of `stress`: PSNR above the baseline, by method; in brackets the change to the
+    method that its second marker has."""
+    from matplotlib import figure as figures
+    places = {cell: place for place, cell in enumerate(STRESS)}
+    figure = figures.Figure(figsize=(9, 1 + 0.4 * len(places)), layout="constrained")
+    axis = figure.subplots()
+    colours = dict(full="C0", nerfw="C1", hanerf="C2", splats="C3", density="C4")
+    for line in table:
+        cell, method = line["row"].split(": ")
+        if line["psnr"]:
+            gain = line["psnr"] - line["psnr_floor"]
+            label = method if method in colours else "as in brackets"
+            axis.errorbar(
+                gain, places[cell], xerr=line["psnr_std"] or 0, label=label, fmt="o", capsize=3,
+                color=colours.get(method, "C9"), markersize=9 if method == "full" else 6)
+    axis.set_yticks(range(len(places)), [f"{cell} ({STRESS[cell][1]})" for cell in places])
+    axis.invert_yaxis()
+    axis.grid(axis="y", alpha=0.5)
+    axis.axvline(0, color="grey", lw=1)
+    axis.set_xlabel("PSNR above the baseline, dB")
+    handles, labels = axis.get_legend_handles_labels()
+    once = dict(zip(labels, handles))
+    axis.legend(once.values(), once.keys(), loc="center left", bbox_to_anchor=(1, 0.5))
     return figure
 
 
@@ -3760,11 +3781,11 @@ def experiment(argv):
     data_prep.check(has_base, f"the first row of {name} has failed: see log.txt of runs in {where}")
     if name == "chart":
         add_times(table)
-        figure = draw_chart(table)
-    else:
-        figure = draw_bars(table, name == "stress")
+    draw = dict(chart=draw_chart, stress=draw_cells).get(name, draw_bars)
+    figure = draw(table)
     write_table(Path(f"{name}.csv"), table)
-    figure.suptitle(f"{Path(source).name}, seeds: {seeds}", fontsize=9)
+    scene = f"{len(STRESS)} toys" if name == "stress" else Path(source).name
+    figure.suptitle(f"{scene}, seeds: {seeds}", fontsize=9)
     data_prep.atomic_write(Path(f"{name}.png"), lambda part: figure.savefig(part, dpi=110))
     print(f"wrote {name}.csv and {name}.png")
 
@@ -3991,6 +4012,27 @@ def test_a_chart_draws_each_method_over_its_cost_and_the_baseline():
         np.testing.assert_array_equal(curves[method], np.stack([costs, curve], 1))
     baseline, = [line for line in axis.lines if line.get_label() == "baseline"]
     assert set(baseline.get_ydata()) == {16.0}
+
+
+def test_bars_show_what_a_row_gains_over_the_first_and_cells_over_their_baseline():
+    table = []
+    for row, psnr, floor in (("crowd: full", 20.0, 16.0), ("crowd: no mask", 17.5, 16.0),
+                             ("sky: splats", 21.0, 18.0), ("sky: nerfw", None, 18.0)):
+        table.append(dict(row=row, psnr=psnr, psnr_std=0.5, psnr_floor=floor))
+    bars, = draw_bars(table).axes
+    names = [label.get_text() for label in bars.get_yticklabels()]
+    gains = {names[round(bar.get_center()[1])]: bar.get_width() for bar in bars.patches}
+    assert gains == {"crowd: full": 0.0, "crowd: no mask": -2.5, "sky: splats": 1.0}
+
+    cells, = draw_cells(table).axes
+    names = [label.get_text() for label in cells.get_yticklabels()]
+    markers = []
+    for marker in cells.containers:
+        gain, place = marker.lines[0].get_xydata()[0]
+        markers.append((marker.get_label(), names[round(place)], gain))
+    sky = "sky (no threshold by place)"
+    assert markers == [("full", "crowd (no mask)", 4.0), ("as in brackets", "crowd (no mask)", 1.5),
+                       ("splats", sky, 3.0)]
 
 
 if __name__ == "__main__":
