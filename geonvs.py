@@ -42,12 +42,12 @@ Departures from the printed paper; the tag stands at the code
         intensity or bimodality; outliers are rejected early; M is fixed at 60 % of training
   [D4]  L_lps is a sum of logarithms, not a product; a layer's bound is exp(c), not softplus(c)
   [D5]  CGNet has a block a stage, GroupNorm, a head at each resolution, and reads small photos
-  [D6]  the background field also renders what lies before the sphere
+  [D6]  the background field also renders what lies in front of the sphere
   [D7]  SfM points place the sphere, seed the octree, pull s and M to 0; s starts as a small sphere;
         no off-surface penalty, no sphere loss with a warm-up
   [D8]  samples and Phi follow a cached SDF; Phi has no gradient, L_GPL moves M alone; derivatives
-        are taken at and near SfM points and at one surface point a ray, whose normal its colours
-        share
+        are taken at and near SfM points and at one surface point a ray, whose normal (no input in
+        the paper) its colours share
   [D9]  zeta stays between a rising floor and a fixed bound
   [D10] cells split where colours err, none is pruned, those of the background stay as seeded; parts
         that a scene does not need are off
@@ -134,7 +134,7 @@ class Config:
     rays: int = 512  # rays per step, of all processes together
     photos: int = 8  # photos per step, of each process; the mask network sees them whole
     samples: int = 15  # intervals S of a ray in the foreground, S + 1 samples
-    bg_samples: int = 24  # background samples per ray, a sixth of them before the sphere
+    bg_samples: int = 24  # background samples per ray, a sixth of them in front of the sphere
     levels: int = 0  # octree levels, 0: from the pixel footprint at the surface
     hidden: int = 64  # width of the MLPs
     appearance_dim: int = 16  # length of a photo's appearance code
@@ -729,7 +729,7 @@ def contract(x):
 
 
 class Background(nn.Module):
-    """A small NeRF before the sphere and beyond it, on an octree over contracted space. [D6]"""
+    """A small NeRF in front of the sphere and beyond it, on an octree over contracted space. [D6]"""
     def __init__(self, points, hidden, extra, levels):
         super().__init__()
         self.octree = Octree(2.0, levels, root=32)  # cells of 1/8
@@ -780,7 +780,7 @@ def render_rays(model, rays, code, jitter, points):
         points   (N,3)    more points, off the rays, at which derivatives are taken
     Returns a dictionary. depth, surface_point and place have no gradient.
         rgb            (R,3)
-        opacity        (R,)      of the foreground, whatever lies before the sphere
+        opacity        (R,)      of the foreground, whatever lies in front of the sphere
         is_solid       (R,)      whether it exceeds a half
         depth          (R,)      where the foreground is hit, on average; t1 if it is not
         surface_point  (R,3)     the point there
