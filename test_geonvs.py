@@ -3696,7 +3696,8 @@ def draw_chart(table):
             width = 5 if method == methods[0] else 1.5
             axis.errorbar(cost, psnr, spread, marker="o", capsize=3, lw=width, label=method)
             if method == methods[0]:
-                axis.set_xticks(cost, [f"{x:.3g}" for x in cost])
+                plain = functools.partial(np.format_float_positional, fractional=False, trim="-")
+                axis.set_xticks(cost, [plain(x, 2) for x in cost])
         axis.minorticks_off()
         axis.legend(loc="center left", bbox_to_anchor=(1, 0.5))
     return figure
@@ -3785,7 +3786,7 @@ def experiment(argv):
     figure = draw(table)
     write_table(Path(f"{name}.csv"), table)
     scene = f"{len(STRESS)} toys" if name == "stress" else Path(source).name
-    figure.suptitle(f"{scene}, seeds: {seeds}", fontsize=9)
+    figure.suptitle(f"{scene}; bars: standard deviation of {seeds} seeds", fontsize=9)
     data_prep.atomic_write(Path(f"{name}.png"), lambda part: figure.savefig(part, dpi=110))
     print(f"wrote {name}.csv and {name}.png")
 
