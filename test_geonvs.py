@@ -3716,7 +3716,7 @@ def draw_bars(table):
     axis.set_yticks(range(len(rows)), [line["row"] for line in rows])
     axis.invert_yaxis()
     axis.axvline(0, color="grey", lw=1)
-    axis.set_xlabel(f"PSNR above the first row ({table[0]['row']}: {table[0]['psnr']:.2f}), dB")
+    axis.set_xlabel(f"PSNR above that of {table[0]['row']} ({table[0]['psnr']:.2f}), dB")
     return figure
 
 
