@@ -729,7 +729,7 @@ def contract(x):
 
 
 class Background(nn.Module):
-    """A small NeRF in front of the sphere and beyond it, on an octree over contracted space. [D6]"""
+    """A small NeRF in front of and beyond the sphere, on an octree over contracted space. [D6]"""
     def __init__(self, points, hidden, extra, levels):
         super().__init__()
         self.octree = Octree(2.0, levels, root=32)  # cells of 1/8
