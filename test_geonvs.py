@@ -3721,8 +3721,8 @@ def draw_bars(table):
 
 
 def draw_cells(table):
-    """In each cell of `stress`: PSNR above the baseline, by method; in brackets the change to the
-    method that its second marker has."""
+    """PSNR above the baseline in each cell of `stress`, a marker for each method. A cell's name has
+    in brackets what is changed in the method for the marker "as in brackets"."""
     from matplotlib import figure as figures
     places = {cell: place for place, cell in enumerate(STRESS)}
     figure = figures.Figure(figsize=(9, 1 + 0.4 * len(places)), layout="constrained")
@@ -3730,20 +3730,24 @@ def draw_cells(table):
     colours = dict(full="C0", nerfw="C1", hanerf="C2", splats="C3", density="C4")
     for line in table:
         cell, method = line["row"].split(": ")
-        if line["psnr"]:
-            gain = line["psnr"] - line["psnr_floor"]
-            label = method if method in colours else "as in brackets"
-            axis.errorbar(
-                gain, places[cell], xerr=line["psnr_std"] or 0, label=label, fmt="o", capsize=3,
-                color=colours.get(method, "C9"), markersize=9 if method == "full" else 6)
+        if not line["psnr"]:  # it diverged
+            continue
+        gain = line["psnr"] - line["psnr_floor"]
+        spread = line["psnr_std"] or 0
+        label = method if method in colours else "as in brackets"
+        colour = colours.get(method, "C9")
+        size = 9 if method == "full" else 6
+        axis.errorbar(
+            gain, places[cell], xerr=spread, fmt="o", capsize=3,
+            color=colour, markersize=size, label=label)
     axis.set_yticks(range(len(places)), [f"{cell} ({STRESS[cell][1]})" for cell in places])
     axis.invert_yaxis()
     axis.grid(axis="y", alpha=0.5)
     axis.axvline(0, color="grey", lw=1)
     axis.set_xlabel("PSNR above the baseline, dB")
     handles, labels = axis.get_legend_handles_labels()
-    once = dict(zip(labels, handles))
-    axis.legend(once.values(), once.keys(), loc="center left", bbox_to_anchor=(1, 0.5))
+    handle_of = dict(zip(labels, handles))  # each label once
+    axis.legend(handle_of.values(), handle_of, loc="center left", bbox_to_anchor=(1, 0.5))
     return figure
 
 
@@ -4016,10 +4020,11 @@ def test_a_chart_draws_each_method_over_its_cost_and_the_baseline():
 
 
 def test_bars_show_what_a_row_gains_over_the_first_and_cells_over_their_baseline():
-    table = []
-    for row, psnr, floor in (("crowd: full", 20.0, 16.0), ("crowd: no mask", 17.5, 16.0),
-                             ("sky: splats", 21.0, 18.0), ("sky: nerfw", None, 18.0)):
-        table.append(dict(row=row, psnr=psnr, psnr_std=0.5, psnr_floor=floor))
+    table = [
+        dict(row="crowd: full", psnr=20.0, psnr_std=0.5, psnr_floor=16.0),
+        dict(row="crowd: no mask", psnr=17.5, psnr_std=0.5, psnr_floor=16.0),
+        dict(row="sky: splats", psnr=21.0, psnr_std=None, psnr_floor=18.0),
+        dict(row="sky: nerfw", psnr=None, psnr_std=None, psnr_floor=18.0)]
     bars, = draw_bars(table).axes
     names = [label.get_text() for label in bars.get_yticklabels()]
     gains = {names[round(bar.get_center()[1])]: bar.get_width() for bar in bars.patches}
@@ -4031,9 +4036,10 @@ def test_bars_show_what_a_row_gains_over_the_first_and_cells_over_their_baseline
     for marker in cells.containers:
         gain, place = marker.lines[0].get_xydata()[0]
         markers.append((marker.get_label(), names[round(place)], gain))
-    sky = "sky (no threshold by place)"
-    assert markers == [("full", "crowd (no mask)", 4.0), ("as in brackets", "crowd (no mask)", 1.5),
-                       ("splats", sky, 3.0)]
+    assert markers == [
+        ("full", "crowd (no mask)", 4.0),
+        ("as in brackets", "crowd (no mask)", 1.5),
+        ("splats", "sky (no threshold by place)", 3.0)]
 
 
 if __name__ == "__main__":
