@@ -981,6 +981,7 @@ def open_scene(name_or_folder, downscale=2):
 
 
 # ---- the toy: z up, front towards -y, in its own units ---------------------------------
+FACADE = -1  # the number of the landmark that is seen from the front alone
 # Arbitrary: centre and scale of the scene must be recovered.
 TOY_SCALE = 3.7
 TOY_ORIGIN = np.array([12.0, -7.0, 5.0])
@@ -1037,6 +1038,20 @@ LANDMARK = [
     Part("column", "statue", "copper", center=(-.8, -.35, .48), half=(.07, .07, .12), top=.04),
     Part("ball", "statue", "copper", center=(-.8, -.35, .64), half=(.055, .055, .055), top=.055),
 ]
+# A palace around a court that opens to the tourists: nothing stands in its middle.
+PALACE = [
+    Part("box", "palace", "stone", center=(0, .06, .03), half=(1, .64, .03), top=1),
+    Part("box", "palace", "sand", center=(0, .56, .45), half=(.95, .1, .42), top=.95),
+    *[Part("column", "palace", "pale", center=(x, .38, .42), half=(.055, .055, .36), top=.045)
+      for x in np.linspace(-.5, .5, 6)],
+    Part("box", "palace", "pale", center=(0, .46, .83), half=(.62, .16, .05), top=.62),
+    Part("box", "palace", "tiles", center=(0, .46, .98), half=(.66, .18, .1), top=0),
+]
+for x in (-.82, .82):
+    PALACE += [
+        Part("box", "palace", "brick", center=(x, .02, .36), half=(.16, .5, .33), top=.16),
+        Part("box", "palace", "slate", center=(x, .02, .77), half=(.2, .54, .08), top=0),
+    ]
 TOWN = [
     Part("ground", "town", "paving", center=(0, 0, 0), half=(2.6, 2.6, 0), top=2.6),
     Part("ground", "town", "meadow", center=(0, 0, 0), half=(np.inf, np.inf, 0), top=np.inf),
@@ -1058,6 +1073,8 @@ for x, y, wide, tall in [  # a house: half width, half height; a tree stands bef
 def toy_parts(landmark, background=True):
     """The parts of a landmark, every number another building, and of the town around."""
     town = TOWN if background else []
+    if landmark == FACADE:
+        return PALACE + town
     if landmark == 0:
         return LANDMARK + town
     rng = np.random.default_rng([landmark, 1])
@@ -1334,24 +1351,26 @@ def make_toy(seed=0, size=96, photos=48, test=8, occluders=0.05, exposure=1.0,
     exposure: spread of brightness, white balance and contrast; 1 as of tourists, 0 to 2
     pose_noise: of the training photos [px rms at the landmark]
     background: False leaves nothing but the landmark, before black
-    landmark: another building for every number
+    landmark: another building for every number; -1 is a palace around an empty court,
+        seen from the front within 120 degrees
     sun: its azimuth differs from photo to photo by up to so many degrees
     sky: how much its colour and clouds differ from photo to photo, 0 to 1
     """
     info = dict(locals(), scene="toy", kind="toy", downscale=1, folder=None, split=None)
     check(
-        seed >= 0 and size >= 16 and photos >= 4 and test >= 0 and landmark >= 0
+        seed >= 0 and size >= 16 and photos >= 4 and test >= 0 and landmark >= -1
         and 0 <= occluders <= 0.6 and 0 <= exposure <= 2 and 0 <= pose_noise < np.inf
         and 0 <= sun <= 180 and 0 <= sky <= 1,
         "occluders in 0..0.6, exposure 0..2, sun 0..180, sky 0..1, size >= 16, "
-        "photos >= 4, others >= 0")
+        "photos >= 4, landmark >= -1, others >= 0")
     # A generator per source of randomness: a knob leaves the random numbers of others alone.
     camera_rng, exposure_rng, people_rng, sfm_rng, pose_rng, sun_rng, sky_rng = [
         np.random.default_rng([seed, k]) for k in range(7)]
     count = photos + test
     numbers = np.arange(count)
     is_test = np.isin(numbers, (np.arange(test) + 0.5) * count // test)
-    azimuth = 200 * (numbers + camera_rng.uniform(0.1, 0.9, count)) / count - 100
+    arc = 120 if landmark == FACADE else 200  # degrees around the landmark
+    azimuth = arc * (numbers + camera_rng.uniform(0.1, 0.9, count)) / count - arc / 2
     share = people_rng.gamma(0.8 + 6 * occluders, size=count) * ~is_test
     share = np.minimum(share / share.sum() * photos * occluders, 0.85)
     turn = np.radians(sun_rng.uniform(-sun, sun, count))  # of the sun
@@ -1384,7 +1403,7 @@ def make_toy(seed=0, size=96, photos=48, test=8, occluders=0.05, exposure=1.0,
         add_pose_noise(pose_rng, K[i], c2w[i], pose_noise * (not is_test[i]))
         c2w[i][:, 3] = c2w[i][:, 3] * TOY_SCALE + TOY_ORIGIN
     signs = np.array(list(itertools.product((-1, 1), repeat=3)))
-    corners = [part.center + part.half * signs for part in parts[:len(LANDMARK)]]
+    corners = [part.center + part.half * signs for part in toy_parts(landmark, background=False)]
     scene = build_scene(
         images, K, c2w, is_test, [f"toy_{i:03d}.png" for i in numbers], points, tracks,
         info, contain=np.array(corners) * TOY_SCALE + TOY_ORIGIN)

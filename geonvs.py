@@ -19,6 +19,7 @@ The paper's equations
   Eq. 5  objective                  objective
          L_rgb, L_eik, L_curv       GeoNVS.losses, of rgb, e_grad, e_curv from render_rays
          L_reg, L_lps               mask_loss, lipschitz_loss
+         off-surface penalty        off_surface_loss, of air_segments
 
 Conventions
   world     the foreground is the unit sphere; x * scale + center leads back to SfM units
@@ -43,8 +44,9 @@ Departures from the printed paper; the tag stands at the code
   [D4]  L_lps is a sum of logarithms, not a product; a layer's bound is exp(c), not softplus(c)
   [D5]  CGNet has a block a stage, GroupNorm, a head at each resolution, and reads small photos
   [D6]  the background field also renders what lies in front of the sphere
-  [D7]  SfM points place the sphere, seed the octree, pull s and M to 0; s starts as a small sphere;
-        no off-surface penalty, no sphere loss with a warm-up
+  [D7]  SfM points place the sphere, seed the octree, pull s and M to 0; the off-surface penalty,
+        which the paper names without a formula, keeps s positive between cameras and points that
+        they saw; s starts as a small sphere; no sphere loss with a warm-up
   [D8]  samples and Phi follow a cached SDF; Phi has no gradient, L_GPL moves M alone; derivatives
         are taken at and near SfM points and at one surface point a ray, whose normal (no input in
         the paper) its colours share
@@ -147,6 +149,7 @@ class Config:
     lam_gpl: float = 0.05  # weight of L_GPL, the geometry-preservation loss (paper)
     lam_lps: float = 1e-5  # weight of L_lps, the Lipschitz loss, log form [D4]
     lam_sfm: float = 7.5e-3  # weight of min(zeta, 40) |s(p)| at SfM points [D7]
+    lam_off: float = 0.03  # weight of L_off, the off-surface penalty: cameras see through air [D7]
     lr_grid: float = 1e-2  # learning rate of octree features
     lr_code: float = 3e-2  # learning rate of appearance codes
     lr_net: float = 4e-3  # learning rate of networks
@@ -284,14 +287,37 @@ def random_rays(scene, img, gen, part=1.0):
     return make_rays(scene, img, (v * h).long() * w + col)
 
 
-def sphere_interval(rays):
-    """Distances (R,1), (R,1) at which rays enter and leave the unit sphere. A ray that misses it,
-    or has it behind, gets an empty interval: at its closest approach, or at near."""
-    closest = -(rays.o * rays.d).sum(1, keepdim=True)  # (R,1)
-    distance = rays.at(closest).norm(dim=2)  # (R,1) from the sphere's centre
+def sphere_interval(o, d, near):
+    """Distances (R,1), (R,1) at which rays o, d (R,3) enter and leave the unit sphere, at near
+    (R,1) or later. A ray that misses the sphere, or has it behind, gets an empty interval: at its
+    closest approach, or at near."""
+    closest = -(o * d).sum(1, keepdim=True)  # (R,1)
+    distance = torch.addcmul(o, closest, d).norm(dim=1, keepdim=True)  # from the sphere's centre
     half = (1 - distance**2).clamp_min(0).sqrt()
-    t0 = torch.maximum(closest - half, rays.near)
+    t0 = torch.maximum(closest - half, near)
     return t0, torch.maximum(closest + half, t0)
+
+
+AIR_GAP = 0.05  # length before an SfM point that does not count as air, in radii of the sphere
+
+
+def air_segments(scene):
+    """Ends (T,2,3) of segments that are air. Where a training photo saw an SfM point, nothing
+    stands between its camera and the point. A segment is the part of that line of sight in the unit
+    sphere; it ends AIR_GAP before the point, or where the line leaves the sphere."""
+    photo, point = [
+        torch.as_tensor(scene.raw[key], device=scene.train.device).long()
+        for key in ("track_photo", "track_point")]
+    is_train = torch.isin(photo, scene.train)
+    photo = photo[is_train]  # (T,)
+    o = scene.c2w[photo, :, 3]  # (T,3)
+    to_point = scene.points[point[is_train]] - o
+    distance = to_point.norm(dim=1, keepdim=True)  # (T,1)
+    d = to_point / distance
+    t0, t1 = sphere_interval(o, d, scene.near[photo, None])
+    t1 = torch.minimum(t1, distance - AIR_GAP)
+    ends = torch.stack([o + t0 * d, o + t1 * d], 1)  # (T,2,3)
+    return ends[t0[:, 0] < t1[:, 0]]
 
 
 # ---- 3 Octree: features on the corners of cells --------------------------------------------------
@@ -487,6 +513,7 @@ def cells_to_split(octree):
 # ---- 4 Fields: the networks on top of the octree -------------------------------------------------
 
 GEOMETRY_FEATURES = 15  # that the SDF network hands to the colour network
+AIR_MARGIN = 0.02  # least s in air, so that a soft surface leaves it transparent, too
 START_RADIUS = 0.25  # of the sphere that s starts as, inside the landmark to which it grows [D7]
 
 
@@ -542,6 +569,12 @@ def finite_differences(s, taps, eps):
 def eikonal(grad):
     """E_grad = (|grad s| - 1)^2 (P,) of gradients (P,3): a distance has slope 1."""
     return (grad.norm(dim=1) - 1) ** 2
+
+
+def off_surface_loss(sdf):
+    """L_off, the paper's off-surface penalty: s (P,) at points known to be air is at least
+    AIR_MARGIN. The paper names it without a formula. [D7]"""
+    return F.relu(AIR_MARGIN - sdf).mean()
 
 
 class SDFField(nn.Module):
@@ -792,7 +825,7 @@ def render_rays(model, rays, code, jitter, points):
         sdf            (N,)      at points
         ray_e_grad, ray_e_curv  (R,)  averages along the ray"""
     fg_jitter, bg_jitter = jitter.tensor_split([model.cfg.samples - 1], 1)
-    t0, t1 = sphere_interval(rays)  # (R,1)
+    t0, t1 = sphere_interval(rays.o, rays.d, rays.near)  # (R,1)
     t = model.cache.sample(rays, t0, t1, fg_jitter, model.alpha)  # (R,S+1)
     x = rays.at(t)  # (R,S+1,3)
     sdf, geo = model.sdf(x)  # (R,S+1), (R,S+1,G)
@@ -1033,6 +1066,7 @@ def objective(loss, cfg):
         + cfg.lam_mask * loss["reg"]
         + cfg.lam_gpl * loss["gpl"]
         + cfg.lam_lps * loss["lps"]
+        + cfg.lam_off * loss["off"]
         + cfg.lam_sfm * loss["sfm"])
 
 
@@ -1049,6 +1083,7 @@ class GeoNVS(nn.Module):
         levels, A, has_background = needed_parts(cfg, scene.raw)
         is_inside = scene.points.norm(dim=1) < 1
         self.sfm = nn.Buffer(scene.points[is_inside], persistent=False)  # (N,3), never empty
+        self.air = nn.Buffer(air_segments(scene), persistent=False)  # (T,2,3), never empty
 
         octree = Octree(1.0, levels)
         seed_octree(octree, self.sfm, dense=0)
@@ -1115,6 +1150,8 @@ class GeoNVS(nn.Module):
         left_out, reg, gpl, ray_complexity = self.transients(rays, photos, out, error, done)
 
         pull = self.zeta().detach().clamp_max(MAX_PULL)  # at first s must be free to change [D7]
+        start, end = self.air[random_index(gen, len(self.air), len(sfm))].unbind(1)  # (N,3)
+        air = start.lerp(end, uniform(gen, len(sfm), 1))  # (N,3)
         loss = dict(
             rgb=((1 - left_out) * residual.mean(1)).mean(),  # [D3]
             eik=out["e_grad"].mean(),  # at surface points, at SfM points and near them [D8]
@@ -1122,6 +1159,7 @@ class GeoNVS(nn.Module):
             reg=reg,
             gpl=gpl,
             lps=lipschitz_loss(self.color),
+            off=pull * off_surface_loss(self.distance(air)),  # [D7]
             sfm=pull * out["sdf"][:len(sfm)].abs().mean())  # [D7]
         total = objective(loss, cfg)
         log = loss | dict(
