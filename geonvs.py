@@ -513,7 +513,6 @@ def cells_to_split(octree):
 # ---- 4 Fields: the networks on top of the octree -------------------------------------------------
 
 GEOMETRY_FEATURES = 15  # that the SDF network hands to the colour network
-AIR_MARGIN = 0.02  # least s in air, so that a soft surface leaves it transparent, too
 START_RADIUS = 0.25  # of the sphere that s starts as, inside the landmark to which it grows [D7]
 
 
@@ -571,10 +570,10 @@ def eikonal(grad):
     return (grad.norm(dim=1) - 1) ** 2
 
 
-def off_surface_loss(sdf):
-    """L_off, the paper's off-surface penalty: s (P,) at points known to be air is at least
-    AIR_MARGIN. The paper names it without a formula. [D7]"""
-    return F.relu(AIR_MARGIN - sdf).mean()
+def off_surface_loss(sdf, margin):
+    """L_off, the paper's off-surface penalty: s (P,) is at least margin at points that are known to
+    be air. The paper names it without a formula. [D7]"""
+    return F.relu(margin - sdf).mean()
 
 
 class SDFField(nn.Module):
@@ -1159,7 +1158,7 @@ class GeoNVS(nn.Module):
             reg=reg,
             gpl=gpl,
             lps=lipschitz_loss(self.color),
-            off=pull * off_surface_loss(self.distance(air)),  # [D7]
+            off=pull * off_surface_loss(self.distance(air), self.sdf.octree.finest),  # [D7]
             sfm=pull * out["sdf"][:len(sfm)].abs().mean())  # [D7]
         total = objective(loss, cfg)
         log = loss | dict(

@@ -1851,7 +1851,7 @@ def plain_losses(model, rays, done):
     terms["lps"] = sum(layer.c for layer in model.color[::2])
     pull = min(40, model.zeta().item())
     terms["sfm"] = pull * model.distance(sfm).abs().mean()
-    terms["off"] = pull * sum(max(0.02 - s, 0 * s) for s in model.distance(air)) / 2
+    terms["off"] = pull * sum(max(model.sdf.octree.finest - s, 0 * s) for s in model.distance(air)) / 2
     return terms
 
 
@@ -3515,7 +3515,7 @@ class Row(NamedTuple):
     seeds: int = 99  # at most
 
 
-NO_GEOMETRY = dict(lam_eik=0.0, lam_curv=0.0, lam_sfm=0.0, lam_gpl=0.0)
+NO_GEOMETRY = dict(lam_eik=0.0, lam_curv=0.0, lam_sfm=0.0, lam_off=0.0, lam_gpl=0.0)
 PAPER_MASK = dict(
     TransientMask=NoThreshold,
     mask_loss=paper_mask_loss,
@@ -3542,6 +3542,7 @@ PAPER = {  # its equations as printed; the mask, GPL and the SDF
 PIECES = {
     "full": Row(),
     "no SfM term": Row(dict(lam_sfm=0.0)),
+    "no air": Row(dict(lam_off=0.0)),
     "no eikonal": Row(dict(lam_eik=0.0)),
     "no curvature": Row(dict(lam_curv=0.0)),
     "no appearance": Row(dict(appearance="off")),
@@ -3562,6 +3563,7 @@ STRESS = {  # knobs of the toy, the row of PAPER or PIECES that is made for them
     "lights": (dict(photos=24, exposure=2.0), "no appearance", 1),
     "sun": (dict(photos=24, sun=60.0), "no normal", 1),
     "sky": (dict(photos=24, sky=1.0), "no threshold by place", 3),
+    "facade": (dict(photos=10, landmark=-1), "no air", 3),
     "few photos": (dict(photos=8), "no SfM term", 3),
     "wrong poses": (dict(photos=24, pose_noise=3.0), "no curvature", 3),
     "other building": (dict(photos=24, landmark=3), "no curvature", 1)}
