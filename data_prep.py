@@ -11,13 +11,17 @@ The landmark lies in the unit sphere. A ray is c2w[:, 3] + t * d with |d| = 1; a
 is this t, never a z-depth. x right, y down, z forward are a camera's axes, as in OpenCV.
 
 Masks. masks/ lies in the folder of photos or beside it; there the mask of photo.jpg is
-photo.png, photo.jpg.png or photo.jpg. Pixels darker than 128 are left out.
+photo.png, photo.jpg.png or photo.jpg. Pixels darker than 128 are left out, and so are
+pixels whose alpha channel is below 128, in a photo or a mask. What is left out is not
+there: points that are seen mostly in such pixels are dropped.
 
 Functions raise UserError, one sentence that says what to do.
 """
 import argparse
+import contextlib
 import difflib
 import gzip
+import hashlib
 import inspect
 import io
 import itertools
@@ -131,7 +135,8 @@ def progress(items, what):
 
 def atomic_write(path, write):
     """write(temporary path), then rename: `path` is the whole old file or the new one."""
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}.{time.time_ns()}{path.suffix}")
+    # Without the stem: a name may have 255 bytes already.
+    temporary = path.with_name(f".{os.getpid()}.{time.time_ns()}{path.suffix}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         write(temporary)
@@ -265,6 +270,16 @@ def find_sphere(x, weight, tracks, is_test, contain):
     return center, radius
 
 
+def mostly_masked(x, K, c2w, wh, tracks, masks):
+    """Which points x (P,3) have more than half of their sightings in masked pixels. -> (P,)"""
+    seen, hidden = np.zeros((2, len(x)))
+    for i, mask in enumerate(masks or ()):
+        uv, _ = project(K[i], c2w[i], x[tracks[i]])
+        seen[tracks[i]] += 1
+        hidden[tracks[i]] += np.ravel(mask)[pixel_index(uv, wh[i])]
+    return 2 * hidden > seen
+
+
 def build_scene(
         images, K, c2w, is_test, name, points, tracks, info, contain=(), masks=None):
     """The scene of images (h,w,3), each of which sees the points tracks (M,).
@@ -273,9 +288,11 @@ def build_scene(
     masks: of each photo (h,w) bool, True is left out.
     """
     error, track_length = points[:, 3:].T
-    usable = track_length >= 3
+    wh = np.array([image.shape[1::-1] for image in images])
+    is_there = ~mostly_masked(points[:, :3], K, c2w, wh, tracks, masks)
+    usable = is_there & (track_length >= 3)
     if usable.sum() < 500:
-        usable = track_length >= 2
+        usable = is_there & (track_length >= 2)
     check(usable.sum() >= 20,
           f"{usable.sum()} usable 3D points: SfM needs more overlapping photos")
     usable &= error <= np.quantile(error[usable], 0.95)
@@ -286,7 +303,6 @@ def build_scene(
     center, radius = find_sphere(x, weight, tracks, is_test, contain)
     c2w = np.array(c2w)
     c2w[:, :, 3] = (c2w[:, :, 3] - center) / radius
-    wh = np.array([image.shape[1::-1] for image in images])
     arrays = dict(
         rgb=np.concatenate([image.reshape(-1, 3) for image in images]),
         start=np.cumsum([0, *wh.prod(1)]),
@@ -478,7 +494,10 @@ def check_photo(camera, pose, is_test):
     wh, K, distortion = camera
     numbers = np.concatenate([K, distortion, pose])
     is_sound = (abs(numbers) < MAX_NUMBER).all() and min(K[:2]) > EPSILON and pose[:4].any()
-    check(is_sound and max(wh) < 32767, "has no sound camera or pose: run SfM again")
+    check(is_sound, "has no sound camera or pose: run SfM again")
+    w, h = wh
+    check(max(wh) < 32767 and w * h < 2 ** 30,
+          f"is {w} x {h} pixels, too large for OpenCV: shrink it, then run SfM again")
     angle = 2 * np.degrees(np.arctan(max(wh / K[:2]) / 2))
     check(is_test or 10 <= angle <= 120,
           f"is {angle:.1f} degrees wide, which is not in 10..120")
@@ -513,23 +532,52 @@ def read_points(sparse):
 # ---- names and folders -----------------------------------------------------------------
 PHOTO_TYPES = (
     ".jpg .jpeg .png .tif .tiff .bmp .webp .ppm .pgm .jp2 .avif .heic .heif".split())
+# Copies that programs and cameras leave beside a photo.
+COPIES = "~", "_original", ".bak", ".thm"
 
 
 def files_below(folder, levels=7):
     """Files at most so many levels down, without hidden folders and thumbnails.
 
-    Links are followed, unlike by rglob; broken ones are files.
+    Links are followed, unlike by rglob. A broken link counts as a file, and so does a
+    folder that may not be read.
     """
     files = []
-    if levels and folder.is_dir():
-        for path in sorted(folder.iterdir()):
-            if path.name.startswith((".", "@")):  # NAS boxes write @eaDir
-                continue
-            if path.is_dir():
-                files += files_below(path, levels - 1)
-            else:
-                files.append(path)
+    try:
+        paths = sorted(folder.iterdir()) if levels and folder.is_dir() else []
+    except PermissionError:
+        return [folder]
+    for path in paths:
+        if path.name.startswith((".", "@")):  # NAS boxes write @eaDir
+            continue
+        if os.path.isdir(path):
+            files += files_below(path, levels - 1)
+        else:
+            files.append(path)
     return files
+
+
+def first_bytes(path):
+    """A file's first bytes, none where it cannot be read."""
+    try:
+        with open(path, "rb") as file:
+            return file.read(16)
+    except OSError:
+        return b""
+
+
+def is_heic(path):
+    """Whether a file is HEIC, by its content; phones often name it .jpg."""
+    return bool(re.match(rb"....ftyp(heic|heix|mif1|msf1)", first_bytes(path), re.DOTALL))
+
+
+def is_photo(path):
+    """Whether a file is a photo: by its extension, or by its content under any other."""
+    name = path.name.lower()
+    if name.endswith((*PHOTO_TYPES, *COPIES)):
+        return not name.endswith(COPIES)
+    head = first_bytes(path)
+    return bool(re.match(rb"\xff\xd8\xff|\x89PNG|RIFF....WEBP", head, re.DOTALL)) or is_heic(path)
 
 
 def photo_files(folder):
@@ -537,8 +585,7 @@ def photo_files(folder):
     files = {}
     for path in files_below(folder):
         name = path.relative_to(folder)
-        is_photo = path.suffix.lower() in PHOTO_TYPES
-        if is_photo and name.parts[0] not in ("dense", "masks"):
+        if name.parts[:1] not in [("dense",), ("masks",)] and is_photo(path):
             files[name.as_posix()] = path
     return files
 
@@ -620,6 +667,9 @@ def find_model(folder, command):
 
     command: how a model is made, for messages
     """
+    for path in files_below(folder):
+        if os.path.isdir(path):
+            warn(f"passed over: the folder {path} may not be read")
     models = [open_model(folder, sparse) for sparse in model_folders(folder)]
     if not models and folder.name in ("images", "input"):
         parent = Path(os.path.abspath(folder)).parent
@@ -659,7 +709,7 @@ def split_files(folder, split):
     """The table of the split, or train_list.txt and test_list.txt: named or in the folder."""
     tables = [
         path for path in sorted(folder.glob("[!.]*.[ct]sv"))
-        if "split" in read_table(path)[0]
+        if os.access(path, os.R_OK) and "split" in read_table(path)[0]
     ]
     if not tables:
         tables = list(folder.glob("train*.txt"))
@@ -706,11 +756,8 @@ def read_split(tables):
     return is_held_out
 
 
-def choose_split(folder, names, tables):
-    """{name: whether it is held out} of the photos that are to be used; tells the rule."""
-    if not tables:
-        print(f"{folder} has no split file: every eighth photo is held out")
-        return {name: i % 8 == 7 for i, name in enumerate(names)}
+def choose_split(names, tables):
+    """{name: whether it is held out} of the photos that the tables name."""
     print(f"split by {tables[0]}")
     is_held_out = read_split(tables)
     matches = match_names(is_held_out, names)
@@ -723,9 +770,9 @@ def choose_split(folder, names, tables):
 
 # ---- checksums -------------------------------------------------------------------------
 def checksum(paths, crc=0):
-    """CRC-32 over the content of the files that exist."""
+    """CRC-32 over the content of the files that exist and may be read."""
     for path in paths:
-        if path.is_file():
+        with contextlib.suppress(FileNotFoundError, PermissionError):
             crc = zlib.crc32(path.read_bytes(), crc)
     return crc
 
@@ -766,27 +813,39 @@ def is_fresh(info):
 
 
 # ---- photos and masks ------------------------------------------------------------------
-def is_heic(path):
-    """Whether a file is HEIC, by its content; phones often name it .jpg."""
-    with open(path, "rb") as file:
-        head = file.read(12)
-    return head[4:8] == b"ftyp" and head[8:] in (b"heic", b"heix", b"mif1", b"msf1")
+# Starts a segment of a JPEG. In pixels FF 00 is a byte and FF D0 to FF D7 are pauses.
+MARKER = re.compile(rb"\xff[\x01-\xcf\xd8-\xfe]")
 
 
 def is_cut_off(data):
-    """Whether a JPEG or PNG file lacks its end, which OpenCV does not report."""
-    if data[1:4] == b"PNG":
-        return b"IEND" not in data
-    last_scan = data.rfind(b"\xff\xda")
-    end_mark = data.rfind(b"\xff\xd9")
-    return data[:2] == b"\xff\xd8" and end_mark < last_scan
+    """Whether a JPEG or PNG file lacks its end, which OpenCV does not report.
+
+    A JPEG ends with its first end mark. A video or raw data may follow, and a segment
+    before it may hold a thumbnail with an end of its own.
+    """
+    if data[:2] != b"\xff\xd8":
+        return data[1:4] == b"PNG" and b"IEND" not in data
+    at = 2
+    while marker := MARKER.search(data, at):
+        at = marker.end()
+        if marker[0] == b"\xff\xd9":
+            return False
+        at += int.from_bytes(data[at:at + 2], "big")  # the segment's length
+    return True
+
+
+def is_memory_full(error):
+    """Whether an error of Python, numpy or OpenCV says so."""
+    return isinstance(error, MemoryError) or "Insufficient memory" in str(error)
 
 
 def decode(data, flags):
     """The decoded image, or None."""
     try:
         return cv2.imdecode(np.frombuffer(data, np.uint8), flags)
-    except cv2.error:  # empty, or more than a gigapixel
+    except cv2.error as e:  # empty, or more than a gigapixel
+        if is_memory_full(e):
+            raise
         return None
 
 
@@ -803,10 +862,9 @@ def undistort(image, camera):
     return image, np.array([P[0, 0], P[1, 1], P[0, 2] + 0.5, P[1, 2] + 0.5])
 
 
-def read_photo(path, camera, downscale):
-    """Reads, undistorts and downscales a photo. -> rgb uint8 (h,w,3), K (4,)"""
-    w, h = camera[0]
-    check(1 <= downscale <= min(w, h) / 2, f"is {w} x {h}: choose another --downscale")
+def read_photo(path, size):
+    """The photo (h,w,3) in uint8, BGR, as a camera of this size (w, h) saw it."""
+    w, h = size
     check(path.is_file(), "is a broken link: copy the photo itself")
     check(not is_heic(path), "is HEIC, which cannot be read: convert it to JPEG")
     data = path.read_bytes()
@@ -822,6 +880,13 @@ def read_photo(path, camera, downscale):
     check(size == (w, h),
           f"has {stored[0]} x {stored[1]} pixels{tag}, its camera {w} x {h}: put back what "
           "SfM saw")
+    return image
+
+
+def shrink_photo(image, camera, downscale):
+    """Undistorts and downscales a photo. -> rgb uint8 (h,w,3), K (4,)"""
+    w, h = camera[0]
+    check(1 <= downscale <= min(w, h) / 2, f"is {w} x {h}: choose another --downscale")
     image, K = undistort(image, camera)
     small = w // downscale, h // downscale
     image = cv2.resize(image, small, interpolation=cv2.INTER_AREA)
@@ -829,19 +894,46 @@ def read_photo(path, camera, downscale):
     return image[..., ::-1], K * np.tile(shrink, 2)  # fx, cx by width; fy, cy by height
 
 
-def read_mask(path, size):
-    """Reads a mask and scales it to its photo's size (w, h).
+def read_grey(path):
+    """A mask file's brightness (h,w)."""
+    grey = decode(path.read_bytes(), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+    check(grey is not None, "is no image")
+    check((grey >= 128).any(), "is black all over; 255 is white")
+    return grey
 
-    -> uint8 (h,w): 0 is left out, 255 is not
+
+def read_alpha(path):
+    """The alpha channel (h,w) of a file, or None if all of it is opaque."""
+    data = path.read_bytes()
+    is_jpeg = data[:2] == b"\xff\xd8"
+    image = None if is_jpeg else decode(data, cv2.IMREAD_UNCHANGED)
+    if image is None or image.shape[2:] != (4,):
+        return None
+    alpha = image[..., 3]
+    if alpha.dtype == np.uint16:
+        alpha = np.uint8(alpha >> 8)
+    check((alpha >= 128).any(), "is transparent all over")
+    return alpha if (alpha < 128).any() else None
+
+
+def read_mask(photo, path, size):
+    """What a photo's mask file (or None) and the alpha channels leave out, in size (w, h).
+
+    -> uint8 (h,w): 0 is left out, 255 is not; None where nothing is. Tells what it cannot use.
     """
-    mask = decode(path.read_bytes(), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
-    check(mask is not None, "is no image")
-    mask = np.where(mask < 128, 0, 255).astype(np.uint8)
-    h, w = mask.shape
-    check(abs(w * size[1] / (h * size[0]) - 1) < 0.02,
-          f"has {w} x {h} pixels, its photo {size[0]} x {size[1]}")
-    check(mask.any(), "is black all over; 255 is white")
-    return cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST)
+    masks = []
+    for read, file in [(read_grey, path), (read_alpha, path), (read_alpha, photo)]:
+        try:
+            layer = read(file) if file else None
+            if layer is not None:
+                h, w = layer.shape
+                check(abs(w * size[1] / (h * size[0]) - 1) < 0.02,
+                      f"has {w} x {h} pixels, its photo {size[0]} x {size[1]}")
+                layer = np.where(layer < 128, 0, 255).astype(np.uint8)
+                masks.append(cv2.resize(layer, size, interpolation=cv2.INTER_NEAREST))
+        except (UserError, OSError) as e:
+            warn(f"mask not used: {file} {e}")
+    return np.min(masks, axis=0) if masks else None
 
 
 def read_masks(model, usable):
@@ -851,16 +943,13 @@ def read_masks(model, usable):
     used = 0
     for name, (image, *_) in usable.items():
         h, w = image.shape[:2]
+        camera = model.photos[name][0]
         masked = np.zeros((h, w), bool)
-        if name in paths:
-            camera = model.photos[name][0]
-            try:
-                mask, _ = undistort(read_mask(paths[name], camera[0]), camera)
-                mask = cv2.resize(mask, (w, h), interpolation=cv2.INTER_AREA)
-                masked = mask < 128
-                used += 1
-            except UserError as e:
-                warn(f"mask not used: {paths[name]} {e}")
+        mask = read_mask(model.files[name], paths.get(name), camera[0])
+        if mask is not None:
+            mask, _ = undistort(mask, camera)
+            masked = cv2.resize(mask, (w, h), interpolation=cv2.INTER_AREA) < 128
+            used += 1
         masks.append(masked)
     if not used:
         return None
@@ -874,18 +963,22 @@ def read_masks(model, usable):
 def read_usable(model, points, rows, is_held_out, downscale):
     """{name: (rgb, K, c2w, rows of its points)} of the photos that can be used.
 
-    Tells which cannot, and why.
+    Tells which cannot, and why. Of photos with the same pixels one is used for training,
+    or none where one is held out.
     """
     usable = {}
     misfits = {}  # photos that miss most of the points that they should see
+    pixels = {}  # hashes
     for name in progress(sorted(is_held_out), "preparing photos"):
         try:
             check(name in model.photos, f"has no pose{name_hint(name, model.files)}")
             check(name in model.files, f"is not on disk{name_hint(name, model.on_disk)}")
             camera, pose, ids = model.photos[name]
             check_photo(camera, pose, is_held_out[name])
-            image, K = read_photo(model.files[name], camera, downscale)
-        except UserError as e:
+            image = read_photo(model.files[name], camera[0])
+            pixels[name] = hashlib.sha256(image).digest()
+            image, K = shrink_photo(image, camera, downscale)
+        except (UserError, OSError) as e:
             warn(f"left out: {name} {e}")
             continue
         c2w = camera_to_world(pose)
@@ -902,6 +995,12 @@ def read_usable(model, points, rows, is_held_out, downscale):
         warn(f"left out: {name} shows {share:.0%} of its points: its pose or its distortion "
              "is wrong")
         del usable[name]
+    first = {}  # the photo that is used, by its pixels
+    for name in sorted(usable, key=lambda name: not is_held_out[name]):
+        twin = first.setdefault(pixels[name], name)
+        if twin != name and not is_held_out[name]:
+            warn(f"left out: {name} is the same photo as {twin}")
+            del usable[name]
     lost = [name for name in is_held_out if is_held_out[name] and name not in usable]
     check(not lost,
           f"held-out photos cannot be used, repair them or hold out others: {lost}")
@@ -909,6 +1008,54 @@ def read_usable(model, points, rows, is_held_out, downscale):
     check(count >= 2,
           f"{count} usable training photos are too few: repair them or the split file")
     return usable
+
+
+def check_sphere(scene):
+    """Tells how the sphere lies; UserError where the reconstruction makes no sense."""
+    spread = [
+        np.std(scene["track_uv"][scene["track_photo"] == i], axis=0).max()
+        for i in np.unique(scene["track_photo"])
+    ]
+    check(np.median(spread) > 0.02,
+          "the points of a photo lie on one spot of it: give poses in the units of the points")
+    inside = (lengths(scene["points"]) < 1).mean()
+    print(f"the sphere has a radius of {scene['scale']:.3g} units of the reconstruction; "
+          f"{inside:.0%} of the points are inside")
+    place, forward = scene["c2w"][:, :, 3], scene["c2w"][:, :, 2]
+    looks_out = (lengths(place) < 1) & ((place * forward).sum(1) > 0)  # the centre is behind
+    if looks_out.mean() > 0.3:
+        warn(f"{looks_out.sum()} of {len(place)} cameras look outwards from within the sphere, as "
+             "in a room: expect poor geometry; this method is for a landmark seen from outside")
+
+
+def read_folder(folder, command, downscale, split):
+    """The scene of a folder; command: how a model is made, for messages."""
+    model = find_model(folder, command)
+    info = dict(
+        scene=folder.resolve().name,
+        kind="colmap",
+        downscale=downscale,
+        folder=str(folder),
+        images=str(model.images),
+        posed=sorted(model.photos),
+        split=split)
+    info["files"] = fingerprint(info)
+    tables = split_files(folder, split)
+    is_held_out = dict.fromkeys(model.files, False)
+    if tables:
+        is_held_out = choose_split(is_held_out, tables)
+    points, rows = read_points(model.sparse)
+    usable = read_usable(model, points, rows, is_held_out, downscale)
+    if not tables:
+        print(f"{folder} has no split file: every eighth photo is held out")
+        is_held_out = {name: i % 8 == 7 for i, name in enumerate(usable)}
+    masks = read_masks(model, usable)
+    images, K, c2w, tracks = zip(*usable.values())
+    is_test = [is_held_out[name] for name in usable]
+    scene = build_scene(
+        images, K, c2w, is_test, list(usable), points, tracks, info, masks=masks)
+    check_sphere(scene)
+    return scene
 
 
 def prepare(name, downscale=2, split=None):
@@ -920,36 +1067,13 @@ def prepare(name, downscale=2, split=None):
         command = f"python data_prep.py {name} --download"
         if not folder.is_dir():
             folder = DATA / SCENES[name][0]
-    model = find_model(folder, command)
-    split = os.path.abspath(split) if split else None
-    info = dict(
-        scene=folder.resolve().name,
-        kind="colmap",
-        downscale=downscale,
-        folder=str(folder),
-        images=str(model.images),
-        posed=sorted(model.photos),
-        split=split)
-    info["files"] = fingerprint(info)
-    tables = split_files(folder, split)
-    is_held_out = choose_split(folder, sorted(model.files), tables)
-    points, rows = read_points(model.sparse)
-    usable = read_usable(model, points, rows, is_held_out, downscale)
-    masks = read_masks(model, usable)
-    images, K, c2w, tracks = zip(*usable.values())
-    is_test = [is_held_out[name] for name in usable]
-    scene = build_scene(
-        images, K, c2w, is_test, list(usable), points, tracks, info, masks=masks)
-    spread = [
-        np.std(scene["track_uv"][scene["track_photo"] == i], axis=0).max()
-        for i in np.unique(scene["track_photo"])
-    ]
-    check(np.median(spread) > 0.02,
-          "the points of a photo lie on one spot of it: give poses in the units of the points")
-    inside = (lengths(scene["points"]) < 1).mean()
-    print(f"the sphere has a radius of {scene['scale']:.3g} units of the reconstruction; "
-          f"{inside:.0%} of the points are inside")
-    return scene
+    try:
+        return read_folder(folder, command, downscale, split and os.path.abspath(split))
+    except (MemoryError, cv2.error) as e:
+        if not is_memory_full(e):
+            raise
+        message = f"the memory is full: use a larger --downscale than {downscale}"
+        raise UserError(message) from e
 
 
 def scene_path(name_or_folder):
@@ -958,7 +1082,7 @@ def scene_path(name_or_folder):
     mark = ""
     if name_or_folder not in ("toy", *SCENES):
         mark = f"-{zlib.crc32(os.fsencode(folder)):08x}"
-    return DATA / f"{folder.name}{mark}.npz"
+    return DATA / f"{folder.name[:50]}{mark}.npz"  # a file's name has 255 bytes at most
 
 
 def open_scene(name_or_folder, downscale=2):
@@ -1501,10 +1625,10 @@ def sfm_photos(images):
     """{name: path} of raw photos, all of which pycolmap can read."""
     files = photo_files(images)
     for name, path in list(files.items()):
-        if not path.is_file():
-            warn(f"left out: {name} is a broken link")
+        if not first_bytes(path):
+            warn(f"left out: {name} is empty, a broken link or may not be read")
             del files[name]
-    check(files, f"{images} has no photos: name the folder that holds them")
+    check(files, f"{images} has no photos of a known type: name the folder that holds them")
     heic = [name for name, path in files.items() if is_heic(path)]
     check(not heic,
           f"{len(heic)} photos are HEIC, such as {heic[:1]}, which cannot be read: convert "
@@ -1517,18 +1641,16 @@ def sfm_photos(images):
 
 def write_sfm_masks(files, masks, folder):
     """Writes masks in the photos' sizes under COLMAP's names, photo.jpg.png."""
-    for name, path in masks.items():
-        photo = decode(
-            files[name].read_bytes(), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-        check(photo is not None, f"{files[name]} is damaged: replace it")
-        try:
-            mask = read_mask(path, photo.shape[1::-1])
-        except UserError as e:
-            warn(f"mask not used: {path} {e}")
+    for name, path in progress(files.items(), "looking for masks"):
+        photo = decode(path.read_bytes(), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+        if photo is None:
+            warn(f"{name} cannot be read, it is damaged or too large: replace it")
             continue
-        target = folder / f"{name}.png"
-        target.parent.mkdir(parents=True, exist_ok=True)
-        target.write_bytes(cv2.imencode(".png", mask)[1].tobytes())
+        mask = read_mask(path, masks.get(name), photo.shape[1::-1])
+        if mask is not None:
+            target = folder / f"{name}.png"
+            target.parent.mkdir(parents=True, exist_ok=True)
+            target.write_bytes(cv2.imencode(".png", mask)[1].tobytes())
 
 
 def import_pycolmap():
@@ -1557,25 +1679,29 @@ def run_sfm(folder):
     masks = mask_files(images, files)
     pycolmap = import_pycolmap()
     work = DATA / f"sfm-{photos_checksum(files, masks):08x}"
-    work.mkdir(parents=True, exist_ok=True)
     database = work / "database.db"
     reader = pycolmap.ImageReaderOptions()
-    if masks:
-        write_sfm_masks(files, masks, work / "masks")
-        reader.mask_path = work / "masks"
+    (work / "masks").mkdir(parents=True, exist_ok=True)
+    write_sfm_masks(files, masks, work / "masks")
+    reader.mask_path = work / "masks"
     # Of 135 photos of a statue in all lights these options pose 104 in one model, not 60.
     features = pycolmap.FeatureExtractionOptions()
     features.sift.estimate_affine_shape = True
     features.sift.domain_size_pooling = True
     matching = pycolmap.FeatureMatchingOptions()
     matching.guided_matching = True
-    pycolmap.extract_features(
-        database, images, sorted(files), reader_options=reader, extraction_options=features)
-    pycolmap.match_exhaustive(database, matching_options=matching)
     with tempfile.TemporaryDirectory(prefix=".sparse", dir=folder) as temporary:
         models = Path(temporary, "models")
         models.mkdir()
-        found = pycolmap.incremental_mapping(database, images, models)
+        try:
+            pycolmap.extract_features(
+                database, images, sorted(files), reader_options=reader,
+                extraction_options=features)
+            pycolmap.match_exhaustive(database, matching_options=matching)
+            found = pycolmap.incremental_mapping(database, images, models)
+        except RuntimeError as e:
+            message = f"pycolmap failed ({e}): delete {work}, which may be damaged, and retry"
+            raise UserError(message) from e
         check(found,
               f"the photos in {folder} do not match each other; take more, with more overlap")
         models.rename(sparse)
