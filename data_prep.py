@@ -597,12 +597,12 @@ def mask_files(images, names):
         folder = images.parent / "masks"
     files = {path.relative_to(folder).as_posix(): path for path in files_below(folder)}
     masks = {}
-    for name in names:
-        other = str(PurePosixPath(name).with_suffix(".png"))
-        for candidate in (other, name + ".png", name):
-            if candidate in files:
-                masks[name] = files[candidate]
-                break
+    for pattern in ("{0.parent}/{0.stem}.png", "{0}.png", "{0}"):
+        wanted = {name: os.path.normpath(pattern.format(PurePosixPath(name))) for name in names}
+        found = match_names(wanted.values(), files)
+        for name in names:
+            if wanted[name] in found:
+                masks.setdefault(name, files[found[wanted[name]]])
     if files and not masks:
         warn(f"{folder} is not used: no name in it, such as {min(files)}, is a photo's")
     return masks
@@ -865,9 +865,9 @@ def undistort(image, camera):
 def read_photo(path, size):
     """The photo (h,w,3) in uint8, BGR, as a camera of this size (w, h) saw it."""
     w, h = size
-    check(path.is_file(), "is a broken link: copy the photo itself")
+    check(path.exists(), "is a broken link: copy the photo itself")
     check(not is_heic(path), "is HEIC, which cannot be read: convert it to JPEG")
-    data = path.read_bytes()
+    data = content(path)
     check(not is_cut_off(data), "is cut off: copy it again")
     image = decode(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     check(image is not None,
@@ -894,17 +894,17 @@ def shrink_photo(image, camera, downscale):
     return image[..., ::-1], K * np.tile(shrink, 2)  # fx, cx by width; fy, cy by height
 
 
-def read_grey(path):
-    """A mask file's brightness (h,w)."""
-    grey = decode(path.read_bytes(), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
-    check(grey is not None, "is no image")
-    check((grey >= 128).any(), "is black all over; 255 is white")
-    return grey
+def content(path):
+    """A file's bytes; UserError, a sentence about the file, where it cannot be read."""
+    try:
+        return path.read_bytes()
+    except OSError as e:
+        raise UserError(f"cannot be read: {e.strerror}") from e
 
 
 def read_alpha(path):
     """The alpha channel (h,w) of a file, or None if all of it is opaque."""
-    data = path.read_bytes()
+    data = content(path)
     is_jpeg = data[:2] == b"\xff\xd8"
     image = None if is_jpeg else decode(data, cv2.IMREAD_UNCHANGED)
     if image is None or image.shape[2:] != (4,):
@@ -916,24 +916,36 @@ def read_alpha(path):
     return alpha if (alpha < 128).any() else None
 
 
-def read_mask(photo, path, size):
-    """What a photo's mask file (or None) and the alpha channels leave out, in size (w, h).
+def read_grey(path):
+    """A mask file's brightness (h,w), at most its alpha."""
+    grey = decode(content(path), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+    check(grey is not None, "is no image")
+    check((grey >= 128).any(), "is black all over; 255 is white")
+    alpha = read_alpha(path)
+    return grey if alpha is None else np.minimum(grey, alpha)
 
-    -> uint8 (h,w): 0 is left out, 255 is not; None where nothing is. Tells what it cannot use.
+
+def read_mask(photo, path, size):
+    """What a photo's mask file, if any, and its alpha channel leave out, in size (w, h).
+
+    -> uint8 (h,w): 0 is left out, 255 is not; None without both. Tells what it cannot use.
     """
-    masks = []
-    for read, file in [(read_grey, path), (read_alpha, path), (read_alpha, photo)]:
+    mask = None
+    for read, file in [(read_grey, path), (read_alpha, photo)]:
         try:
             layer = read(file) if file else None
-            if layer is not None:
-                h, w = layer.shape
-                check(abs(w * size[1] / (h * size[0]) - 1) < 0.02,
-                      f"has {w} x {h} pixels, its photo {size[0]} x {size[1]}")
-                layer = np.where(layer < 128, 0, 255).astype(np.uint8)
-                masks.append(cv2.resize(layer, size, interpolation=cv2.INTER_NEAREST))
-        except (UserError, OSError) as e:
+            if layer is None:
+                continue
+            h, w = layer.shape
+            check(abs(w * size[1] / (h * size[0]) - 1) < 0.02,
+                  f"has {w} x {h} pixels, its photo {size[0]} x {size[1]}")
+        except UserError as e:
             warn(f"mask not used: {file} {e}")
-    return np.min(masks, axis=0) if masks else None
+            continue
+        layer = np.where(layer < 128, 0, 255).astype(np.uint8)
+        layer = cv2.resize(layer, size, interpolation=cv2.INTER_NEAREST)
+        mask = layer if mask is None else np.minimum(mask, layer)
+    return mask
 
 
 def read_masks(model, usable):
@@ -978,7 +990,7 @@ def read_usable(model, points, rows, is_held_out, downscale):
             image = read_photo(model.files[name], camera[0])
             pixels[name] = hashlib.sha256(image).digest()
             image, K = shrink_photo(image, camera, downscale)
-        except (UserError, OSError) as e:
+        except UserError as e:
             warn(f"left out: {name} {e}")
             continue
         c2w = camera_to_world(pose)
