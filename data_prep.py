@@ -118,19 +118,17 @@ def progress(items, what):
     wait = 1 if is_terminal else 60  # seconds
     due = max(10, wait)
     begin = time.monotonic()
-    total = len(items)
     for done, item in enumerate(items, 1):
         yield item
         elapsed = time.monotonic() - begin
-        is_last = done == total
+        is_last = done == len(items)
         if elapsed > due or (is_last and elapsed > 10):
             due = elapsed + wait
-            left = elapsed / done * (total - done)
-            line = f"  {what}: {done} of {total}, {left:.0f} s left "
-            if is_terminal:
-                line = "\r" + line  # over the one before
+            left = elapsed / done * (len(items) - done)
+            start = "\r" if is_terminal else ""  # over the line before
             end = "" if is_terminal and not is_last else "\n"
-            print(line, end=end, flush=True)
+            line = f"  {what}: {done} of {len(items)}, {left:.0f} s left "
+            print(start + line, end=end, flush=True)
 
 
 def atomic_write(path, write):
@@ -162,21 +160,14 @@ def refuse_bomb(path):
 
 def check_scene(scene):
     """UserError with the name of the first bad array; read_scene turns it into a sentence."""
-    sizes = {
-        "photos": len(scene["wh"]),
-        "photos + 1": len(scene["wh"]) + 1,
-        "pixels": len(scene["rgb"]),
-        "points": len(scene["points"]),
-        "observations": len(scene["track_photo"]),
-        "surface points": len(scene.get("wall", ())),
-        "points near surfaces": len(scene.get("near_wall", ())),
-    }
+    sizes = {2: 2, 3: 3, 4: 4}  # by name, of the first array that has it
     optional = {key: OPTIONAL[key] for key in OPTIONAL.keys() & scene}
     for key, (dtype, shape) in (FORMAT | optional).items():
         value = scene[key]
-        shape = tuple(sizes.get(size, size) for size in shape)
         has_dtype = str(value.dtype).startswith(dtype)  # "<U" fits a text of any length
-        check(value.shape == shape and has_dtype, key)
+        check(has_dtype and value.ndim == len(shape), key)
+        for name, size in zip(shape, value.shape):
+            check(sizes.setdefault(name, size) == size, key)
         if dtype.startswith("float") and key not in ("bg_color", "depth"):
             check(np.isfinite(value).all(), key)
     for key, count in [("track_photo", sizes["photos"]), ("track_point", sizes["points"])]:
@@ -333,10 +324,7 @@ def brightness_spread(points, brightness):
     all_points = np.concatenate(points)
     mean = np.bincount(all_points, np.concatenate(brightness))
     mean /= np.maximum(np.bincount(all_points), 1)  # (P,)
-    offsets = []
-    for track, b in zip(points, brightness):
-        if len(track):
-            offsets.append(np.median(b - mean[track]))
+    offsets = [np.median(b - mean[track]) for track, b in zip(points, brightness) if len(track)]
     return np.std(offsets) if offsets else np.float64(0)
 
 
@@ -351,26 +339,10 @@ def common_color(colors):
 
 
 def add_statistics(scene):
-    """Adds near, track_uv, footprint, exposure_spread, bg_color.
+    """Adds to a scene what follows from its other arrays.
 
     near: 0.8 x the 2 % quantile of the distances of a photo's points, >= 0.02;
-    0.05 without points.
-    """
-    near, track_uv = [], []
-    for i, (K, c2w, wh) in enumerate(zip(scene["K"], scene["c2w"], scene["wh"])):
-        track = scene["track_point"][scene["track_photo"] == i]
-        uv, distance = project(K, c2w, scene["points"][track])
-        track_uv.append(np.clip(uv / wh, -1, 2))
-        near.append(max(0.8 * np.quantile(distance, 0.02), 0.02) if len(track) else 0.05)
-    arrays = dict(
-        near=np.float32(near),
-        track_uv=np.concatenate(track_uv, dtype=np.float32))
-    return scene | arrays | training_statistics(scene)
-
-
-def training_statistics(scene):
-    """The numbers of FORMAT that come from the training photos, without masked pixels.
-
+    0.05 without points. The others are about pixels of training photos without a mask.
     footprint: lower quartile of a pixel's size at points in the sphere.
     exposure_spread: standard deviation of the photos' brightness at the same points.
     bg_color: seen by rays that miss the sphere, NaN unless 60 % agree.
@@ -378,57 +350,51 @@ def training_statistics(scene):
     rgb = scene["rgb"]
     masked = scene.get("masked", np.zeros(len(rgb), bool))
     step = max(1, len(rgb) // 500_000)  # large scenes need not every background pixel
+    near, track_uv = [], []
     observed, sizes, brightness, background = [], [], [], []
-    for i in np.flatnonzero(~scene["is_test"]):
-        first, K, c2w, wh = [scene[key][i] for key in ("start", "K", "c2w", "wh")]
+    for i, (K, c2w, wh) in enumerate(zip(scene["K"], scene["c2w"], scene["wh"])):
         track = scene["track_point"][scene["track_photo"] == i]
         x = scene["points"][track]
         uv, distance = project(K, c2w, x)
+        track_uv.append(np.clip(uv / wh, -1, 2))
+        near.append(max(0.8 * np.quantile(distance, 0.02), 0.02) if len(track) else 0.05)
+        if scene["is_test"][i]:
+            continue
         sizes.append(distance[lengths(x) < 1] / K[0])
-        pixel = first + pixel_index(uv, wh)
+        pixel = scene["start"][i] + pixel_index(uv, wh)
         is_seen = ~masked[pixel]
         observed.append(track[is_seen])
         brightness.append(rgb[pixel[is_seen]].mean(1) / 255)
         o = c2w[:, 3]
         d = ray_directions(K, c2w, *wh)
         closest = o - np.minimum(d @ o, 0)[:, None] * d  # to the centre, along each ray
-        is_background = lengths(closest) > 1
-        is_background &= ~masked[first:first + len(d)]
-        background.append(rgb[first + np.flatnonzero(is_background)[::step]])
-    return dict(
+        pixel = scene["start"][i] + np.arange(len(d))
+        is_background = (lengths(closest) > 1) & ~masked[pixel]
+        background.append(rgb[pixel[is_background][::step]])
+    return scene | dict(
+        near=np.float32(near),
+        track_uv=np.concatenate(track_uv, dtype=np.float32),
         footprint=np.quantile(np.concatenate(sizes), 0.25),
         exposure_spread=brightness_spread(observed, brightness),
         bg_color=common_color(np.concatenate(background)))
 
 
 # ---- COLMAP models ---------------------------------------------------------------------
-# COLMAP's camera models in the order of their numbers, with their parameters.
-CAMERA_MODELS = dict(
-    SIMPLE_PINHOLE="f cx cy",
-    PINHOLE="fx fy cx cy",
-    SIMPLE_RADIAL="f cx cy k1",
-    RADIAL="f cx cy k1 k2",
-    OPENCV="fx fy cx cy k1 k2 p1 p2",
-    OPENCV_FISHEYE="fx fy cx cy k1 k2 k3 k4",
-    FULL_OPENCV="fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6",
-    FOV="fx fy cx cy omega",
-    SIMPLE_RADIAL_FISHEYE="f cx cy k",
-    RADIAL_FISHEYE="f cx cy k1 k2",
-    THIN_PRISM_FISHEYE="fx fy cx cy k1 k2 p1 p2 k3 k4 sx1 sy1",
-    RAD_TAN_THIN_PRISM_FISHEYE="fx fy cx cy k0 k1 k2 k3 k4 k5 p0 p1 s0 s1 s2 s3",
-    SIMPLE_DIVISION="f cx cy k",
-    DIVISION="fx fy cx cy k",
-    SIMPLE_FISHEYE="f cx cy",
-    FISHEYE="fx fy cx cy",
-    EUCM="fx fy cx cy alpha beta",
-    EQUIRECTANGULAR="w h",
-)
-PERSPECTIVE = "SIMPLE_PINHOLE PINHOLE SIMPLE_RADIAL RADIAL OPENCV FULL_OPENCV".split()
+# COLMAP's camera models: the numbers of their parameters, and what the perspective ones mean.
+PARAMETERS = [3, 4, 4, 5, 8, 8, 12, 5, 4, 5, 12, 16, 4, 5, 3, 4, 6, 2]
+PERSPECTIVE = {
+    0: "f cx cy",
+    1: "fx fy cx cy",
+    2: "f cx cy k1",
+    3: "f cx cy k1 k2",
+    4: "fx fy cx cy k1 k2 p1 p2",
+    6: "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6",
+}
 OPENCV_DISTORTION = "k1 k2 p1 p2 k3 k4 k5 k6".split()
 
 
-def open_binary(path):
-    """A function that reads the next values of a little-endian file, by struct's layouts."""
+def records(path):
+    """Yields, for each record of a COLMAP file, a function that reads values by a layout."""
     check(path.is_file(),
           f"{path} is missing: copy the whole model, or for points run "
           "colmap point_triangulator")
@@ -436,28 +402,27 @@ def open_binary(path):
 
     def read(layout):
         try:
-            record = struct.Struct("<" + layout)
+            record = struct.Struct("<" + layout)  # little-endian, without gaps
             return record.unpack(file.read(record.size))
         except struct.error as e:  # too few bytes are left, or the count is absurd
             message = f"{path} ends too early: copy it again, or delete its folder"
             raise UserError(message) from e
-    return read
+    (count,) = read("Q")
+    for _ in range(count):
+        yield read
 
 
 def read_cameras(sparse):
     """{number: (wh, K (4,), OPENCV_DISTORTION (8,))} of a model's perspective cameras."""
     cameras = {}
-    read = open_binary(sparse / "cameras.bin")
-    (count,) = read("Q")
-    for _ in range(count):
+    for read in records(sparse / "cameras.bin"):
         number, kind, *wh = read("IiQQ")
-        check(0 <= kind < len(CAMERA_MODELS),
+        check(0 <= kind < len(PARAMETERS),
               f"{sparse} has camera model {kind}, which is unknown: run "
               "colmap image_undistorter")
-        model, names = list(CAMERA_MODELS.items())[kind]
-        names = names.split()
-        value = dict(zip(names, read(f"{len(names)}d")))
-        if model in PERSPECTIVE:
+        numbers = read(f"{PARAMETERS[kind]}d")
+        if kind in PERSPECTIVE:
+            value = dict(zip(PERSPECTIVE[kind].split(), numbers))
             f = value.get("f")
             K = [value.get("fx", f), value.get("fy", f), value["cx"], value["cy"]]
             distortion = [value.get(name, 0.0) for name in OPENCV_DISTORTION]
@@ -469,9 +434,7 @@ def read_photos(sparse):
     """{name: (camera or None, pose (7,), ids of its points)} of a COLMAP model."""
     cameras = read_cameras(sparse)
     photos = {}
-    read = open_binary(sparse / "images.bin")
-    (count,) = read("Q")
-    for _ in range(count):
+    for read in records(sparse / "images.bin"):
         _, *pose, camera = read("I7dI")
         letters = iter(lambda: read("c")[0], b"\0")  # the name ends with a zero byte
         name = b"".join(letters).decode(errors="surrogateescape")
@@ -514,9 +477,7 @@ def camera_to_world(pose):
 def read_points(sparse):
     """Points (P,5) of a COLMAP model, as in build_scene, and {id: row} of them."""
     points, rows = [], {}
-    read = open_binary(sparse / "points3D.bin")
-    (count,) = read("Q")
-    for _ in range(count):
+    for read in records(sparse / "points3D.bin"):
         point_id, x, y, z, *_, error, track_length = read("Q3d3BdQ")
         read(f"{2 * track_length}I")  # the track, skipped: photos list their points
         rows[point_id] = len(points)
@@ -530,10 +491,12 @@ def read_points(sparse):
 
 
 # ---- names and folders -----------------------------------------------------------------
-PHOTO_TYPES = (
+HEIC = rb"....ftyp(heic|heix|mif1|msf1)"  # how a file starts; phones often name it .jpg
+# A photo has one of these endings or starts. Some programs leave copies beside it.
+PHOTO_STARTS = rb"\xff\xd8\xff|\x89PNG|RIFF....WEBP|" + HEIC
+PHOTO_ENDINGS = tuple(
     ".jpg .jpeg .png .tif .tiff .bmp .webp .ppm .pgm .jp2 .avif .heic .heif".split())
-# Copies that programs and cameras leave beside a photo.
-COPIES = "~", "_original", ".bak", ".thm"
+COPY_ENDINGS = ("~", "_original", ".bak", ".thm")
 
 
 def files_below(folder, levels=7):
@@ -557,36 +520,25 @@ def files_below(folder, levels=7):
     return files
 
 
-def first_bytes(path):
-    """A file's first bytes, none where it cannot be read."""
+def starts_with(path, pattern):
+    """Whether a file can be read and its first bytes match."""
     try:
         with open(path, "rb") as file:
-            return file.read(16)
+            return bool(re.match(pattern, file.read(16), re.DOTALL))
     except OSError:
-        return b""
-
-
-def is_heic(path):
-    """Whether a file is HEIC, by its content; phones often name it .jpg."""
-    return bool(re.match(rb"....ftyp(heic|heix|mif1|msf1)", first_bytes(path), re.DOTALL))
-
-
-def is_photo(path):
-    """Whether a file is a photo: by its extension, or by its content under any other."""
-    name = path.name.lower()
-    if name.endswith((*PHOTO_TYPES, *COPIES)):
-        return not name.endswith(COPIES)
-    head = first_bytes(path)
-    return bool(re.match(rb"\xff\xd8\xff|\x89PNG|RIFF....WEBP", head, re.DOTALL)) or is_heic(path)
+        return False
 
 
 def photo_files(folder):
     """{name: path} of the photos below a folder, without masks/ and copies in dense/."""
     files = {}
     for path in files_below(folder):
-        name = path.relative_to(folder)
-        if name.parts[:1] not in [("dense",), ("masks",)] and is_photo(path):
-            files[name.as_posix()] = path
+        name = path.relative_to(folder).as_posix()
+        ending = name.lower()
+        if name.startswith(("dense/", "masks/")) or ending.endswith(COPY_ENDINGS):
+            continue
+        if ending.endswith(PHOTO_ENDINGS) or starts_with(path, PHOTO_STARTS):
+            files[name] = path
     return files
 
 
@@ -707,102 +659,91 @@ def read_table(path):
 
 def split_files(folder, split):
     """The table of the split, or train_list.txt and test_list.txt: named or in the folder."""
-    tables = [
-        path for path in sorted(folder.glob("[!.]*.[ct]sv"))
-        if os.access(path, os.R_OK) and "split" in read_table(path)[0]
-    ]
-    if not tables:
-        tables = list(folder.glob("train*.txt"))
     if split:
-        tables = [Path(split)]
-    check(len(tables) < 2,
-          f"choose a split file by --split: {', '.join(map(str, tables))}")
-    if tables and tables[0].suffix == ".txt":
-        name = tables[0].name
-        tables = [
-            tables[0].with_name(re.sub("train|test", subset, name))
-            for subset in ("train", "test")
-        ]
-    return tables
+        found = [Path(split)]
+    else:
+        found = [
+            path for path in sorted(folder.glob("[!.]*.[ct]sv"))
+            if os.access(path, os.R_OK) and "split" in read_table(path)[0]
+        ] or list(folder.glob("train*.txt"))
+    check(len(found) < 2, f"choose a split file by --split: {', '.join(map(str, found))}")
+    if found and found[0].suffix == ".txt":
+        names = [re.sub("train|test", subset, found[0].name) for subset in ("train", "test")]
+        found = [found[0].with_name(name) for name in names]
+    return found
 
 
-def read_split(tables):
-    """{name: whether it is held out} of what split_files finds.
+def read_split(tables, names):
+    """{name: whether it is held out} of what split_files finds, with names as they are here.
 
     A table has NeRF-W's columns; rows with an empty id do not count.
     """
     path = tables[0]
+    print(f"split by {path}")
     if len(tables) == 2:
-        rows = [
-            dict(filename=words[0], split=subset)
-            for subset, names in zip(("train", "test"), tables)
-            for words in read_table(names)
+        head = ["filename", "split"]
+        lines = [
+            (words[0], subset)
+            for subset, names_of in zip(("train", "test"), tables)
+            for words in read_table(names_of)
         ]
     else:
         head, *lines = read_table(path)
         check("filename" in head and "split" in head,
               f"{path} needs a header with filename and split")
-        rows = [dict(zip(head, words)) for words in lines]
     is_held_out = {}
-    for row in rows:
+    for line in lines:
+        row = dict(zip(head, line))
+        name, subset = row.get("filename"), row.get("split")
+        is_test = subset == "test"
         if row.get("id") == "":
             continue
-        name = row.get("filename")
-        subset = row.get("split")
-        is_test = subset == "test"
         check(name and subset in ("train", "test") and is_held_out.get(name, is_test) == is_test,
               f"{path}: {name!r} is {subset!r}; each is train or test, and not both")
         is_held_out[name] = is_test
-    return is_held_out
-
-
-def choose_split(names, tables):
-    """{name: whether it is held out} of the photos that the tables name."""
-    print(f"split by {tables[0]}")
-    is_held_out = read_split(tables)
     matches = match_names(is_held_out, names)
     is_held_out = {matches.get(name, name): is_test for name, is_test in is_held_out.items()}
     rest = set(names) - is_held_out.keys()
     if rest:
-        warn(f"{len(rest)} photos are not in {tables[0]}: {min(rest)} ...")
+        warn(f"{len(rest)} photos are not in {path}: {min(rest)} ...")
     return is_held_out
 
 
 # ---- checksums -------------------------------------------------------------------------
-def checksum(paths, crc=0):
-    """CRC-32 over the content of the files that exist and may be read."""
-    for path in paths:
+def checksum(files):
+    """CRC-32 over names and content of the files that may be read. files: (name, path) ..."""
+    crc = 0
+    for name, path in files:
+        crc = zlib.crc32(os.fsencode(name), crc)
         with contextlib.suppress(FileNotFoundError, PermissionError):
             crc = zlib.crc32(path.read_bytes(), crc)
     return crc
 
 
-def photos_checksum(files, masks, crc=0):
-    """CRC-32 over the photos' names and content and their masks. files, masks: {name: path}"""
-    for name in sorted(files):
-        crc = zlib.crc32(os.fsencode(name), crc)
-        paths = [files[name]]
-        if name in masks:
-            paths.append(masks[name])
-        crc = checksum(paths, crc)
-    return crc
+def with_masks(files, masks):
+    """(name, path) of photos in order, each followed by its mask, if any; for checksum."""
+    return [
+        (name, path)
+        for name in sorted(files)
+        for path in (files[name], masks.get(name)) if path
+    ]
 
 
 def fingerprint(info):
     """CRC-32 over the content of all files that a scene is read from, wherever they lie."""
     folder = Path(info["folder"])
     images = Path(info["images"])
-    models = [
+    sources = [
         sparse / name
         for sparse in model_folders(folder)
         for name in ("cameras.bin", "images.bin", "points3D.bin")
     ]
+    sources += split_files(folder, info["split"])
     there = photo_files(images)
-    files = {
-        name: there[other] for name, other in match_names(info["posed"], there).items()}
+    matches = match_names(info["posed"], there)
+    files = {name: there[other] for name, other in matches.items()}
     masks = mask_files(images, files)
-    crc = checksum([*models, *split_files(folder, info["split"])])
-    return photos_checksum(files, masks, crc)
+    return checksum([*[("", path) for path in sources], *with_masks(files, masks)])
 
 
 def is_fresh(info):
@@ -866,7 +807,7 @@ def read_photo(path, size):
     """The photo (h,w,3) in uint8, BGR, as a camera of this size (w, h) saw it."""
     w, h = size
     check(path.exists(), "is a broken link: copy the photo itself")
-    check(not is_heic(path), "is HEIC, which cannot be read: convert it to JPEG")
+    check(not starts_with(path, HEIC), "is HEIC, which cannot be read: convert it to JPEG")
     data = content(path)
     check(not is_cut_off(data), "is cut off: copy it again")
     image = decode(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
@@ -1055,7 +996,7 @@ def read_folder(folder, command, downscale, split):
     tables = split_files(folder, split)
     is_held_out = dict.fromkeys(model.files, False)
     if tables:
-        is_held_out = choose_split(is_held_out, tables)
+        is_held_out = read_split(tables, model.files)
     points, rows = read_points(model.sparse)
     usable = read_usable(model, points, rows, is_held_out, downscale)
     if not tables:
@@ -1637,11 +1578,11 @@ def sfm_photos(images):
     """{name: path} of raw photos, all of which pycolmap can read."""
     files = photo_files(images)
     for name, path in list(files.items()):
-        if not first_bytes(path):
+        if not starts_with(path, b"."):
             warn(f"left out: {name} is empty, a broken link or may not be read")
             del files[name]
     check(files, f"{images} has no photos of a known type: name the folder that holds them")
-    heic = [name for name, path in files.items() if is_heic(path)]
+    heic = [name for name, path in files.items() if starts_with(path, HEIC)]
     check(not heic,
           f"{len(heic)} photos are HEIC, such as {heic[:1]}, which cannot be read: convert "
           "them to JPEG")
@@ -1690,7 +1631,7 @@ def run_sfm(folder):
     files = sfm_photos(images)
     masks = mask_files(images, files)
     pycolmap = import_pycolmap()
-    work = DATA / f"sfm-{photos_checksum(files, masks):08x}"
+    work = DATA / f"sfm-{checksum(with_masks(files, masks)):08x}"
     database = work / "database.db"
     reader = pycolmap.ImageReaderOptions()
     (work / "masks").mkdir(parents=True, exist_ok=True)
