@@ -308,10 +308,7 @@ def build_scene(
         center=center,
         scale=radius,
         info=json.dumps(info))
-    scene = {}
-    for key, value in arrays.items():
-        dtype, _ = FORMAT[key]
-        scene[key] = np.asarray(value, dtype)
+    scene = {key: np.asarray(value, FORMAT[key][0]) for key, value in arrays.items()}
     if masks:
         scene["masked"] = np.concatenate([mask.ravel() for mask in masks])
     return add_statistics(scene)
@@ -505,18 +502,14 @@ def files_below(folder, levels=7):
     Links are followed, unlike by rglob. A broken link counts as a file, and so does a
     folder that may not be read.
     """
-    files = []
     try:
         paths = sorted(folder.iterdir()) if levels and folder.is_dir() else []
     except PermissionError:
         return [folder]
+    files = []
     for path in paths:
-        if path.name.startswith((".", "@")):  # NAS boxes write @eaDir
-            continue
-        if os.path.isdir(path):
-            files += files_below(path, levels - 1)
-        else:
-            files.append(path)
+        if not path.name.startswith((".", "@")):  # NAS boxes write @eaDir
+            files += files_below(path, levels - 1) if os.path.isdir(path) else [path]
     return files
 
 
@@ -560,23 +553,20 @@ def mask_files(images, names):
     return masks
 
 
-def plain_name(name):
-    """A form that names share if they differ in case or Unicode form only."""
-    folded = unicodedata.normalize("NFC", name).casefold()
-    return unicodedata.normalize("NFC", folded)
-
-
 def match_names(wanted, there):
-    """{wanted name: its name there}: equal, or of equal plain_name if only one has it."""
+    """{wanted name: its name there}: equal, or alike if only one has it on each side.
+
+    Names that differ in case or Unicode form only are alike.
+    """
     found = {name: name for name in wanted if name in there}
-    ours, theirs = defaultdict(list), defaultdict(list)  # plain name: names
-    for name in set(wanted) - found.keys():
-        ours[plain_name(name)].append(name)
-    for name in set(there) - found.keys():
-        theirs[plain_name(name)].append(name)
-    for plain in ours.keys() & theirs.keys():
-        if len(ours[plain]) == 1 and len(theirs[plain]) == 1:
-            found[ours[plain][0]] = theirs[plain][0]
+    alike = defaultdict(lambda: ([], []))  # a form that they share: names of both sides
+    for side, names in enumerate([wanted, there]):
+        for name in set(names) - found.keys():
+            folded = unicodedata.normalize("NFC", name).casefold()
+            alike[unicodedata.normalize("NFC", folded)][side].append(name)
+    for ours, theirs in alike.values():
+        if len(ours) == len(theirs) == 1:
+            found[ours[0]] = theirs[0]
     return found
 
 
@@ -684,23 +674,21 @@ def read_split(tables, names):
         head = ["filename", "split"]
         lines = [
             (words[0], subset)
-            for subset, names_of in zip(("train", "test"), tables)
-            for words in read_table(names_of)
+            for subset, table in zip(("train", "test"), tables)
+            for words in read_table(table)
         ]
     else:
         head, *lines = read_table(path)
-        check("filename" in head and "split" in head,
+        check({"filename", "split"} <= set(head),
               f"{path} needs a header with filename and split")
     is_held_out = {}
-    for line in lines:
-        row = dict(zip(head, line))
+    for row in [dict(zip(head, line)) for line in lines]:
         name, subset = row.get("filename"), row.get("split")
         is_test = subset == "test"
-        if row.get("id") == "":
-            continue
-        check(name and subset in ("train", "test") and is_held_out.get(name, is_test) == is_test,
-              f"{path}: {name!r} is {subset!r}; each is train or test, and not both")
-        is_held_out[name] = is_test
+        if row.get("id") != "":
+            is_clear = is_held_out.setdefault(name, is_test) == is_test
+            check(name and subset in ("train", "test") and is_clear,
+                  f"{path}: {name!r} is {subset!r}; each is train or test, and not both")
     matches = match_names(is_held_out, names)
     is_held_out = {matches.get(name, name): is_test for name, is_test in is_held_out.items()}
     rest = set(names) - is_held_out.keys()
@@ -710,23 +698,21 @@ def read_split(tables, names):
 
 
 # ---- checksums -------------------------------------------------------------------------
-def checksum(files):
-    """CRC-32 over names and content of the files that may be read. files: (name, path) ..."""
+def checksum(files, masks, sources=()):
+    """CRC-32 over the photos' names and content, their masks, and other sources' content.
+
+    files, masks: {name: path}. A file that is missing or may not be read adds nothing.
+    """
+    named = [("", path) for path in sources]
+    for name in sorted(files):
+        named += [(name, files[name]), ("", masks.get(name))]
     crc = 0
-    for name, path in files:
+    for name, path in named:
         crc = zlib.crc32(os.fsencode(name), crc)
-        with contextlib.suppress(FileNotFoundError, PermissionError):
-            crc = zlib.crc32(path.read_bytes(), crc)
+        if path and path.is_file():
+            with contextlib.suppress(PermissionError):
+                crc = zlib.crc32(path.read_bytes(), crc)
     return crc
-
-
-def with_masks(files, masks):
-    """(name, path) of photos in order, each followed by its mask, if any; for checksum."""
-    return [
-        (name, path)
-        for name in sorted(files)
-        for path in (files[name], masks.get(name)) if path
-    ]
 
 
 def fingerprint(info):
@@ -742,15 +728,7 @@ def fingerprint(info):
     there = photo_files(images)
     matches = match_names(info["posed"], there)
     files = {name: there[other] for name, other in matches.items()}
-    masks = mask_files(images, files)
-    return checksum([*[("", path) for path in sources], *with_masks(files, masks)])
-
-
-def is_fresh(info):
-    """Whether a scene's sources are unchanged, or gone: a scene file needs none of them."""
-    if not Path(info["folder"]).is_dir():
-        return True
-    return "posed" in info and info["files"] == fingerprint(info)
+    return checksum(files, mask_files(images, files), sources)
 
 
 # ---- photos and masks ------------------------------------------------------------------
@@ -777,7 +755,8 @@ def is_cut_off(data):
 
 def is_memory_full(error):
     """Whether an error of Python, numpy or OpenCV says so."""
-    return isinstance(error, MemoryError) or "Insufficient memory" in str(error)
+    says = ("Insufficient memory", "Failed to allocate")
+    return isinstance(error, MemoryError) or any(text in str(error) for text in says)
 
 
 def decode(data, flags):
@@ -786,7 +765,7 @@ def decode(data, flags):
         return cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error as e:  # empty, or more than a gigapixel
         if is_memory_full(e):
-            raise
+            raise MemoryError("the memory is full: use smaller photos") from e
         return None
 
 
@@ -848,11 +827,9 @@ def read_alpha(path):
     data = content(path)
     is_jpeg = data[:2] == b"\xff\xd8"
     image = None if is_jpeg else decode(data, cv2.IMREAD_UNCHANGED)
-    if image is None or image.shape[2:] != (4,):
+    if image is None or image.shape[2:] != (4,) or image.dtype.kind != "u":
         return None
-    alpha = image[..., 3]
-    if alpha.dtype == np.uint16:
-        alpha = np.uint8(alpha >> 8)
+    alpha = image[..., 3] / (np.iinfo(image.dtype).max / 255)
     check((alpha >= 128).any(), "is transparent all over")
     return alpha if (alpha < 128).any() else None
 
@@ -871,39 +848,34 @@ def read_mask(photo, path, size):
 
     -> uint8 (h,w): 0 is left out, 255 is not; None without both. Tells what it cannot use.
     """
-    mask = None
+    layers = []
     for read, file in [(read_grey, path), (read_alpha, photo)]:
         try:
             layer = read(file) if file else None
-            if layer is None:
-                continue
-            h, w = layer.shape
-            check(abs(w * size[1] / (h * size[0]) - 1) < 0.02,
-                  f"has {w} x {h} pixels, its photo {size[0]} x {size[1]}")
+            if layer is not None:
+                h, w = layer.shape
+                check(abs(w * size[1] / (h * size[0]) - 1) < 0.02,
+                      f"has {w} x {h} pixels, its photo {size[0]} x {size[1]}")
+                layer = np.where(layer < 128, 0, 255).astype(np.uint8)
+                layers.append(cv2.resize(layer, size, interpolation=cv2.INTER_NEAREST))
         except UserError as e:
             warn(f"mask not used: {file} {e}")
-            continue
-        layer = np.where(layer < 128, 0, 255).astype(np.uint8)
-        layer = cv2.resize(layer, size, interpolation=cv2.INTER_NEAREST)
-        mask = layer if mask is None else np.minimum(mask, layer)
-    return mask
+    return np.min(layers, axis=0) if layers else None
 
 
 def read_masks(model, usable):
     """The pixels that are left out of each usable photo: a list of (h,w) bool, or None."""
     paths = mask_files(model.images, usable)
-    masks = []
+    masks = [np.zeros(image.shape[:2], bool) for image, *_ in usable.values()]
     used = 0
-    for name, (image, *_) in usable.items():
-        h, w = image.shape[:2]
+    for i, name in enumerate(usable):
         camera = model.photos[name][0]
-        masked = np.zeros((h, w), bool)
         mask = read_mask(model.files[name], paths.get(name), camera[0])
         if mask is not None:
             mask, _ = undistort(mask, camera)
-            masked = cv2.resize(mask, (w, h), interpolation=cv2.INTER_AREA) < 128
+            size = masks[i].shape[::-1]
+            masks[i] = cv2.resize(mask, size, interpolation=cv2.INTER_AREA) < 128
             used += 1
-        masks.append(masked)
     if not used:
         return None
     black = np.mean(np.concatenate([masked.ravel() for masked in masks]))
@@ -1032,21 +1004,26 @@ def prepare(name, downscale=2, split=None):
 def scene_path(name_or_folder):
     """data/<scene>.npz; folders get a suffix, so that two of one name do not share a file."""
     folder = Path(name_or_folder).resolve()
-    mark = ""
-    if name_or_folder not in ("toy", *SCENES):
-        mark = f"-{zlib.crc32(os.fsencode(folder)):08x}"
+    is_known = name_or_folder in ("toy", *SCENES)
+    mark = "" if is_known else f"-{zlib.crc32(os.fsencode(folder)):08x}"
     return DATA / f"{folder.name[:50]}{mark}.npz"  # a file's name has 255 bytes at most
 
 
 def open_scene(name_or_folder, downscale=2):
-    """Scene from its file: made on first use, and anew if the content of a source differs."""
+    """Scene from its file: made on first use, and anew if the content of a source differs.
+
+    Where the sources are gone the file is all that is needed.
+    """
     path = scene_path(name_or_folder)
     split = None
     if path.exists():
         scene = read_scene(path)
         info = json.loads(str(scene["info"]))
         split = info["split"]  # named once, by --split
-        if info["kind"] == "toy" or (info["downscale"] == downscale and is_fresh(info)):
+        if info["kind"] == "toy":
+            return scene
+        is_gone = not Path(info["folder"]).is_dir()
+        if info["downscale"] == downscale and (is_gone or info["files"] == fingerprint(info)):
             return scene
     print(f"making {path}")
     if name_or_folder == "toy":
@@ -1631,7 +1608,7 @@ def run_sfm(folder):
     files = sfm_photos(images)
     masks = mask_files(images, files)
     pycolmap = import_pycolmap()
-    work = DATA / f"sfm-{checksum(with_masks(files, masks)):08x}"
+    work = DATA / f"sfm-{checksum(files, masks):08x}"
     database = work / "database.db"
     reader = pycolmap.ImageReaderOptions()
     (work / "masks").mkdir(parents=True, exist_ok=True)
@@ -1680,9 +1657,7 @@ def main(argv=None):
     allow_any_character()
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C
     given = vars(parser.parse_args(argv))
-    name = given.pop("scene")
-    is_download = given.pop("download", False)
-    is_sfm = given.pop("sfm", False)
+    name, is_download, is_sfm = [given.pop(key, None) for key in ("scene", "download", "sfm")]
     path = scene_path(name)
     allowed = knobs if name == "toy" else ("downscale", "split")
     wrong = given.keys() - allowed
