@@ -285,7 +285,8 @@ def build_scene(
     if usable.sum() < 500:
         usable = is_there & (track_length >= 2)
     check(usable.sum() >= 20,
-          f"{usable.sum()} usable 3D points: SfM needs more overlapping photos")
+          f"{usable.sum()} usable 3D points: SfM needs more overlapping photos, or masks cover "
+          "too much")
     usable &= error <= np.quantile(error[usable], 0.95)
     new_index = np.cumsum(usable) - 1
     tracks = [new_index[track[usable[track]]] for track in tracks]  # drop unusable, renumber
@@ -455,9 +456,8 @@ def check_photo(camera, pose, is_test):
     numbers = np.concatenate([K, distortion, pose])
     is_sound = (abs(numbers) < MAX_NUMBER).all() and min(K[:2]) > EPSILON and pose[:4].any()
     check(is_sound, "has no sound camera or pose: run SfM again")
-    w, h = wh
-    check(max(wh) < 32767 and w * h < 2 ** 30,
-          f"is {w} x {h} pixels, too large for OpenCV: shrink it, then run SfM again")
+    check(max(wh) < 32767,
+          f"is {wh[0]} x {wh[1]} pixels, too large for OpenCV: shrink it, then run SfM again")
     angle = 2 * np.degrees(np.arctan(max(wh / K[:2]) / 2))
     check(is_test or 10 <= angle <= 120,
           f"is {angle:.1f} degrees wide, which is not in 10..120")

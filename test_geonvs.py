@@ -715,7 +715,6 @@ def dangle(model):
     infinite=(change("cameras", 0, [1, 24, 32, 30, 30, np.inf, 1]), "no sound camera or pose"),
     no_camera=(change("camera_ids", 0, 12345), "no camera in the model"),
     panorama=(change("cameras", 0, [1, 33000, 9, 99, 99, 9, 9]), "is 33000 x 9 pixels, too large"),
-    gigapixel=(change("cameras", 0, [1, 32000, 64000, 99, 99, 9, 9]), "too large for OpenCV"),
     wrong_pose=(change("poses", (0, 4), 99), "shows 0% of its points"),
     folding=(change("cameras", 0, [2, 24, 32, 26, 12, 16, 300]), "its pose or its distortion"),
     empty=(new(PHOTO, b""), "is empty, damaged, too large or no photo"),
@@ -1343,6 +1342,13 @@ def test_sfm_leaves_out_transparent_pixels(pycolmap):
     (mask,) = Path("data").rglob("masks/*")
     assert mask.name == "toy_000.png.png"
     assert (cv2.imread(str(mask), cv2.IMREAD_GRAYSCALE) == 0).mean() == 1 / 4
+
+
+def test_renamed_photos_are_matched_anew(model):
+    first, second = Path("place/images/toy_000.png"), Path("place/images/toy_001.png")
+    sums = [data_prep.checksum({name: first}, masks) for name, masks in [
+        ("a.png", {}), ("b.png", {}), ("a.png", {"a.png": second})]]
+    assert len(set(sums)) == 3
 
 
 def test_sfm_asks_for_its_place_first(pycolmap, monkeypatch):
