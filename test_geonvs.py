@@ -580,7 +580,9 @@ def test_the_cameras_of_photos_shrink_with_them(model):
 
 @cases(
     "kind, focal, distortion",
+    simple_pinhole=(0, [70], []),
     simple_radial=(2, [70], [.2]),
+    radial=(3, [70], [.2, .05]),
     opencv=(4, [70, 72], [.1, 0, .01, -.01]),
     full_opencv=(6, [70, 72], [.1, 0, .01, -.01, 0, 0, 0, .5]))
 def test_distorted_photos_agree_with_their_camera(model, kind, focal, distortion):
@@ -1009,8 +1011,8 @@ def with_alpha(kind, dtype=np.uint8):
     png_of_16_bits=(with_alpha(".png", np.uint16), 1 / 4),
     tiff=(with_alpha(".tiff"), 1 / 4),
     webp=(with_alpha(".webp"), 1 / 4),
-    opaque=(cv2.imencode(".png", np.full((32, 24, 4), 255))[1].tobytes(), 0),
-    transparent=(cv2.imencode(".png", np.zeros((32, 24, 4)))[1].tobytes(), 0))
+    opaque=(encoded(np.full((32, 24, 4), 255)), 0),
+    transparent=(encoded(np.zeros((32, 24, 4))), 0))
 def test_an_alpha_channel_is_a_mask(model, file, share):
     put(PHOTO, file)
     scene, out, err = made("--downscale 1")
