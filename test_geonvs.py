@@ -594,7 +594,7 @@ def test_distorted_photos_agree_with_their_camera(model, kind, focal, distortion
     write_model(model)
     scene = data_prep.prepare("place", 1)
     d = data_prep.ray_directions(scene["K"][0], np.eye(3), 90, 60)
-    padded = np.append(distortion, np.zeros(7))[:8]
+    padded = np.append(distortion, np.zeros(8))[:8]
     xy, _ = cv2.projectPoints(d, np.zeros(3), np.zeros(3), np.eye(3), padded)
     uv = xy[:, 0] * focal + (44, 31)
     miss = photo(scene, 0)[..., 0].ravel() - uv @ (1, 2)
