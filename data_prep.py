@@ -522,15 +522,19 @@ def starts_with(path, pattern):
         return False
 
 
-def photo_files(folder):
-    """{name: path} of the photos below a folder, without masks/ and copies in dense/."""
+def photo_files(folder, posed=()):
+    """{name: path} of the photos below a folder, without masks/ and copies in dense/.
+
+    A file that the model names is one of them, whatever its type.
+    """
     files = {}
     for path in files_below(folder):
         name = path.relative_to(folder).as_posix()
         ending = name.lower()
-        if name.startswith(("dense/", "masks/")) or ending.endswith(COPY_ENDINGS):
-            continue
-        if ending.endswith(PHOTO_ENDINGS) or starts_with(path, PHOTO_STARTS):
+        is_copy = name.startswith(("dense/", "masks/")) or ending.endswith(COPY_ENDINGS)
+        is_photo = not is_copy and (
+            ending.endswith(PHOTO_ENDINGS) or starts_with(path, PHOTO_STARTS))
+        if is_photo or name in posed:
             files[name] = path
     return files
 
@@ -586,7 +590,7 @@ def open_model(folder, sparse):
         places += [place / "images", place / "input", place]
         if place == folder:
             break
-    on_disk = [photo_files(place) for place in places]
+    on_disk = [photo_files(place, photos) for place in places]
     matches = [match_names(photos, files) for files in on_disk]
     best = max(range(len(places)), key=lambda i: len(matches[i]))
     files = {name: on_disk[best][other] for name, other in matches[best].items()}
@@ -709,8 +713,8 @@ def checksum(files, masks, sources=()):
     crc = 0
     for name, path in named:
         crc = zlib.crc32(os.fsencode(name), crc)
-        if path and path.is_file():
-            with contextlib.suppress(PermissionError):
+        if path:
+            with contextlib.suppress(FileNotFoundError, PermissionError):
                 crc = zlib.crc32(path.read_bytes(), crc)
     return crc
 
@@ -725,7 +729,7 @@ def fingerprint(info):
         for name in ("cameras.bin", "images.bin", "points3D.bin")
     ]
     sources += split_files(folder, info["split"])
-    there = photo_files(images)
+    there = photo_files(images, set(info["posed"]))
     matches = match_names(info["posed"], there)
     files = {name: there[other] for name, other in matches.items()}
     return checksum(files, mask_files(images, files), sources)
@@ -1022,7 +1026,7 @@ def open_scene(name_or_folder, downscale=2):
         split = info["split"]  # named once, by --split
         if info["kind"] == "toy":
             return scene
-        is_gone = not Path(info["folder"]).is_dir()
+        is_gone = not os.path.isdir(info["folder"])
         if info["downscale"] == downscale and (is_gone or info["files"] == fingerprint(info)):
             return scene
     print(f"making {path}")

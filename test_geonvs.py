@@ -740,6 +740,16 @@ def test_what_cannot_be_used_is_named(model, spoil, says):
     assert "masked" not in scene
 
 
+def test_a_photo_of_an_unknown_type_is_named(model):
+    PHOTO.rename(IMAGES / "toy_000.dng")
+    put(IMAGES / "toy_000.dng", "raw data")
+    change("names", 0, "toy_000.dng")(model)
+    TABLE.unlink()
+    scene, out, err = made()
+    assert "8 photos on disk, 8 posed" in out
+    assert err.startswith("left out: toy_000.dng is empty, damaged, too large or no photo of a known")
+
+
 def test_bad_photos_are_found_in_one_go(model):
     change("poses", [0, 4, 6], np.nan)(model)
     code, out, err = run_main("place")
