@@ -736,8 +736,8 @@ def fingerprint(info):
 
 
 # ---- photos and masks ------------------------------------------------------------------
-# Starts a segment of a JPEG. In pixels FF 00 is a byte and FF D0 to FF D7 are pauses.
-MARKER = re.compile(rb"\xff[\x01-\xcf\xd8-\xfe]")
+# Starts a segment of a JPEG or ends it; FF 00 is a byte of pixels, the others have no length.
+MARKER = re.compile(rb"\xff[\x02-\xcf\xd9-\xfe]")
 
 
 def is_cut_off(data):
@@ -1633,7 +1633,7 @@ def run_sfm(folder):
                 extraction_options=features)
             pycolmap.match_exhaustive(database, matching_options=matching)
             found = pycolmap.incremental_mapping(database, images, models)
-        except RuntimeError as e:
+        except (RuntimeError, ValueError) as e:
             message = f"pycolmap failed ({e}): delete {work}, which may be damaged, and retry"
             raise UserError(message) from e
         check(found,
@@ -1674,7 +1674,8 @@ def main(argv=None):
         scene = make_toy(**given) if name == "toy" else prepare(name, **given)
         write_scene(path, scene)
     except (UserError, OSError, MemoryError, KeyboardInterrupt) as e:
-        warn(f"error: {str(e) or 'stopped; start again'}")
+        reason = "the memory is full" if is_memory_full(e) else "stopped; start again"
+        warn(f"error: {str(e) or reason}")
         sys.exit(2)
     print(f"{path}: {len(scene['wh'])} photos, {scene['is_test'].sum()} of them for testing")
 
