@@ -12,8 +12,8 @@ is this t, never a z-depth. x right, y down, z forward are a camera's axes, as i
 
 Masks. masks/ lies in the folder of photos or beside it; there the mask of photo.jpg is
 photo.png, photo.jpg.png or photo.jpg. Pixels darker than 128 are left out, and so are
-pixels whose alpha channel is below 128, in a photo or a mask. What is left out is not
-there: points that are seen mostly in such pixels are dropped.
+pixels whose alpha channel is below 128, in a photo or a mask. A point that most photos
+see in such pixels is dropped.
 
 Functions raise UserError, one sentence that says what to do.
 """
@@ -337,7 +337,7 @@ def common_color(colors):
 
 
 def add_statistics(scene):
-    """Adds to a scene what follows from its other arrays.
+    """Adds the arrays that follow from the others.
 
     near: 0.8 x the 2 % quantile of the distances of a photo's points, >= 0.02;
     0.05 without points. The others are about pixels of training photos without a mask.
@@ -848,9 +848,9 @@ def read_grey(path):
 
 
 def read_mask(photo, path, size):
-    """What a photo's mask file, if any, and its alpha channel leave out, in size (w, h).
+    """The mask of a photo by its mask file, if any, and its alpha channel, in size (w, h).
 
-    -> uint8 (h,w): 0 is left out, 255 is not; None without both. Tells what it cannot use.
+    -> uint8 (h,w): 0 is left out, 255 is not; None without both. A bad mask is told.
     """
     layers = []
     for read, file in [(read_grey, path), (read_alpha, photo)]:
@@ -892,8 +892,8 @@ def read_masks(model, usable):
 def read_usable(model, points, rows, is_held_out, downscale):
     """{name: (rgb, K, c2w, rows of its points)} of the photos that can be used.
 
-    Tells which cannot, and why. Of photos with the same pixels one is used for training,
-    or none where one is held out.
+    Prints which cannot, and why. Of photos with the same pixels one is used for training,
+    or none if one of them is held out.
     """
     usable = {}
     misfits = {}  # photos that miss most of the points that they should see
@@ -940,7 +940,7 @@ def read_usable(model, points, rows, is_held_out, downscale):
 
 
 def check_sphere(scene):
-    """Tells how the sphere lies; UserError where the reconstruction makes no sense."""
+    """Prints size and content of the sphere; UserError if points and poses disagree."""
     spread = [
         np.std(scene["track_uv"][scene["track_photo"] == i], axis=0).max()
         for i in np.unique(scene["track_photo"])
