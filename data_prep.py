@@ -566,8 +566,7 @@ def match_names(wanted, there):
     alike = defaultdict(lambda: ([], []))  # a form that they share: names of both sides
     for side, names in enumerate([wanted, there]):
         for name in set(names) - found.keys():
-            folded = unicodedata.normalize("NFC", name).casefold()
-            alike[unicodedata.normalize("NFC", folded)][side].append(name)
+            alike[unicodedata.normalize("NFC", name).casefold()][side].append(name)
     for ours, theirs in alike.values():
         if len(ours) == len(theirs) == 1:
             found[ours[0]] = theirs[0]

@@ -747,7 +747,7 @@ def test_a_photo_of_an_unknown_type_is_named(model):
     TABLE.unlink()
     scene, out, err = made()
     assert "8 photos on disk, 8 posed" in out
-    assert err.startswith("left out: toy_000.dng is empty, damaged, too large or no photo of a known")
+    assert err.startswith("left out: toy_000.dng is empty, damaged, too large or no photo")
 
 
 def test_bad_photos_are_found_in_one_go(model):
@@ -1378,7 +1378,7 @@ def fail(function, error):
     "spoil, says",
     has_model=(new(SPARSE / "0/images.bin"), "place has sparse/ or dense/, a model: leave --sfm"),
     no_photos=(move(IMAGES), "place has no photos"),
-    damaged=(fail("extract_features", RuntimeError("no database")), "(no database): delete data/sfm"),
+    damaged=(fail("extract_features", RuntimeError("no table")), "(no table): delete data/sfm"),
     heic=(new(IMAGES / "phone.jpg", HEIC), "1 photos are HEIC, such as ['phone.jpg']"),
     no_utf8=(move(PHOTO, IMAGES / "\udcff.png"), "is not UTF-8: rename the photo"),
     no_pycolmap=(lambda model: sys.modules.update(pycolmap=None), 'run pip install "pycolmap>='),
@@ -1421,6 +1421,7 @@ def test_misspelt_commands_exit_with_2(model, command):
     "happens, says",
     ctrl_c=(KeyboardInterrupt, "stopped"),
     sigterm=(lambda **knobs: signal.raise_signal(signal.SIGTERM), "stopped"),
+    full_memory=(MemoryError(), "the memory is full"),
     full_disk=(OSError(28, "No space left"), "No space left"))
 def test_a_stop_is_one_sentence(in_tmp_dir, monkeypatch, happens, says):
     make_toy = mock.create_autospec(data_prep.make_toy, side_effect=happens)
