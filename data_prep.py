@@ -11,13 +11,17 @@ The landmark lies in the unit sphere. A ray is c2w[:, 3] + t * d with |d| = 1; a
 is this t, never a z-depth. x right, y down, z forward are a camera's axes, as in OpenCV.
 
 Masks. masks/ lies in the folder of photos or beside it; there the mask of photo.jpg is
-photo.png, photo.jpg.png or photo.jpg. Pixels darker than 128 are left out.
+photo.png, photo.jpg.png or photo.jpg. Pixels darker than 128 are left out, and so are
+pixels whose alpha channel is below 128, in a photo or a mask. A point that most photos
+see in such pixels is dropped.
 
 Functions raise UserError, one sentence that says what to do.
 """
 import argparse
+import contextlib
 import difflib
 import gzip
+import hashlib
 import inspect
 import io
 import itertools
@@ -114,24 +118,23 @@ def progress(items, what):
     wait = 1 if is_terminal else 60  # seconds
     due = max(10, wait)
     begin = time.monotonic()
-    total = len(items)
     for done, item in enumerate(items, 1):
         yield item
         elapsed = time.monotonic() - begin
-        is_last = done == total
+        is_last = done == len(items)
         if elapsed > due or (is_last and elapsed > 10):
             due = elapsed + wait
-            left = elapsed / done * (total - done)
-            line = f"  {what}: {done} of {total}, {left:.0f} s left "
-            if is_terminal:
-                line = "\r" + line  # over the one before
+            left = elapsed / done * (len(items) - done)
+            start = "\r" if is_terminal else ""  # over the line before
             end = "" if is_terminal and not is_last else "\n"
-            print(line, end=end, flush=True)
+            line = f"  {what}: {done} of {len(items)}, {left:.0f} s left "
+            print(start + line, end=end, flush=True)
 
 
 def atomic_write(path, write):
     """write(temporary path), then rename: `path` is the whole old file or the new one."""
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}.{time.time_ns()}{path.suffix}")
+    # Without the stem: a name may have 255 bytes already.
+    temporary = path.with_name(f".{os.getpid()}.{time.time_ns()}{path.suffix}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         write(temporary)
@@ -157,21 +160,14 @@ def refuse_bomb(path):
 
 def check_scene(scene):
     """UserError with the name of the first bad array; read_scene turns it into a sentence."""
-    sizes = {
-        "photos": len(scene["wh"]),
-        "photos + 1": len(scene["wh"]) + 1,
-        "pixels": len(scene["rgb"]),
-        "points": len(scene["points"]),
-        "observations": len(scene["track_photo"]),
-        "surface points": len(scene.get("wall", ())),
-        "points near surfaces": len(scene.get("near_wall", ())),
-    }
+    sizes = {2: 2, 3: 3, 4: 4}  # by name, of the first array that has it
     optional = {key: OPTIONAL[key] for key in OPTIONAL.keys() & scene}
     for key, (dtype, shape) in (FORMAT | optional).items():
         value = scene[key]
-        shape = tuple(sizes.get(size, size) for size in shape)
         has_dtype = str(value.dtype).startswith(dtype)  # "<U" fits a text of any length
-        check(value.shape == shape and has_dtype, key)
+        check(has_dtype and value.ndim == len(shape), key)
+        for name, size in zip(shape, value.shape):
+            check(sizes.setdefault(name, size) == size, key)
         if dtype.startswith("float") and key not in ("bg_color", "depth"):
             check(np.isfinite(value).all(), key)
     for key, count in [("track_photo", sizes["photos"]), ("track_point", sizes["points"])]:
@@ -265,6 +261,16 @@ def find_sphere(x, weight, tracks, is_test, contain):
     return center, radius
 
 
+def mostly_masked(x, K, c2w, wh, tracks, masks):
+    """Which points x (P,3) have more than half of their sightings in masked pixels. -> (P,)"""
+    seen, hidden = np.zeros((2, len(x)))
+    for i, mask in enumerate(masks or ()):
+        uv, _ = project(K[i], c2w[i], x[tracks[i]])
+        seen[tracks[i]] += 1
+        hidden[tracks[i]] += np.ravel(mask)[pixel_index(uv, wh[i])]
+    return 2 * hidden > seen
+
+
 def build_scene(
         images, K, c2w, is_test, name, points, tracks, info, contain=(), masks=None):
     """The scene of images (h,w,3), each of which sees the points tracks (M,).
@@ -273,11 +279,14 @@ def build_scene(
     masks: of each photo (h,w) bool, True is left out.
     """
     error, track_length = points[:, 3:].T
-    usable = track_length >= 3
+    wh = np.array([image.shape[1::-1] for image in images])
+    is_there = ~mostly_masked(points[:, :3], K, c2w, wh, tracks, masks)
+    usable = is_there & (track_length >= 3)
     if usable.sum() < 500:
-        usable = track_length >= 2
+        usable = is_there & (track_length >= 2)
     check(usable.sum() >= 20,
-          f"{usable.sum()} usable 3D points: SfM needs more overlapping photos")
+          f"{usable.sum()} usable 3D points: SfM needs more overlapping photos, or masks cover "
+          "too much")
     usable &= error <= np.quantile(error[usable], 0.95)
     new_index = np.cumsum(usable) - 1
     tracks = [new_index[track[usable[track]]] for track in tracks]  # drop unusable, renumber
@@ -286,7 +295,6 @@ def build_scene(
     center, radius = find_sphere(x, weight, tracks, is_test, contain)
     c2w = np.array(c2w)
     c2w[:, :, 3] = (c2w[:, :, 3] - center) / radius
-    wh = np.array([image.shape[1::-1] for image in images])
     arrays = dict(
         rgb=np.concatenate([image.reshape(-1, 3) for image in images]),
         start=np.cumsum([0, *wh.prod(1)]),
@@ -301,10 +309,7 @@ def build_scene(
         center=center,
         scale=radius,
         info=json.dumps(info))
-    scene = {}
-    for key, value in arrays.items():
-        dtype, _ = FORMAT[key]
-        scene[key] = np.asarray(value, dtype)
+    scene = {key: np.asarray(value, FORMAT[key][0]) for key, value in arrays.items()}
     if masks:
         scene["masked"] = np.concatenate([mask.ravel() for mask in masks])
     return add_statistics(scene)
@@ -317,10 +322,7 @@ def brightness_spread(points, brightness):
     all_points = np.concatenate(points)
     mean = np.bincount(all_points, np.concatenate(brightness))
     mean /= np.maximum(np.bincount(all_points), 1)  # (P,)
-    offsets = []
-    for track, b in zip(points, brightness):
-        if len(track):
-            offsets.append(np.median(b - mean[track]))
+    offsets = [np.median(b - mean[track]) for track, b in zip(points, brightness) if len(track)]
     return np.std(offsets) if offsets else np.float64(0)
 
 
@@ -335,26 +337,10 @@ def common_color(colors):
 
 
 def add_statistics(scene):
-    """Adds near, track_uv, footprint, exposure_spread, bg_color.
+    """Adds the arrays that follow from the others.
 
     near: 0.8 x the 2 % quantile of the distances of a photo's points, >= 0.02;
-    0.05 without points.
-    """
-    near, track_uv = [], []
-    for i, (K, c2w, wh) in enumerate(zip(scene["K"], scene["c2w"], scene["wh"])):
-        track = scene["track_point"][scene["track_photo"] == i]
-        uv, distance = project(K, c2w, scene["points"][track])
-        track_uv.append(np.clip(uv / wh, -1, 2))
-        near.append(max(0.8 * np.quantile(distance, 0.02), 0.02) if len(track) else 0.05)
-    arrays = dict(
-        near=np.float32(near),
-        track_uv=np.concatenate(track_uv, dtype=np.float32))
-    return scene | arrays | training_statistics(scene)
-
-
-def training_statistics(scene):
-    """The numbers of FORMAT that come from the training photos, without masked pixels.
-
+    0.05 without points. The others are about pixels of training photos without a mask.
     footprint: lower quartile of a pixel's size at points in the sphere.
     exposure_spread: standard deviation of the photos' brightness at the same points.
     bg_color: seen by rays that miss the sphere, NaN unless 60 % agree.
@@ -362,57 +348,51 @@ def training_statistics(scene):
     rgb = scene["rgb"]
     masked = scene.get("masked", np.zeros(len(rgb), bool))
     step = max(1, len(rgb) // 500_000)  # large scenes need not every background pixel
+    near, track_uv = [], []
     observed, sizes, brightness, background = [], [], [], []
-    for i in np.flatnonzero(~scene["is_test"]):
-        first, K, c2w, wh = [scene[key][i] for key in ("start", "K", "c2w", "wh")]
+    for i, (K, c2w, wh) in enumerate(zip(scene["K"], scene["c2w"], scene["wh"])):
         track = scene["track_point"][scene["track_photo"] == i]
         x = scene["points"][track]
         uv, distance = project(K, c2w, x)
+        track_uv.append(np.clip(uv / wh, -1, 2))
+        near.append(max(0.8 * np.quantile(distance, 0.02), 0.02) if len(track) else 0.05)
+        if scene["is_test"][i]:
+            continue
         sizes.append(distance[lengths(x) < 1] / K[0])
-        pixel = first + pixel_index(uv, wh)
+        pixel = scene["start"][i] + pixel_index(uv, wh)
         is_seen = ~masked[pixel]
         observed.append(track[is_seen])
         brightness.append(rgb[pixel[is_seen]].mean(1) / 255)
         o = c2w[:, 3]
         d = ray_directions(K, c2w, *wh)
         closest = o - np.minimum(d @ o, 0)[:, None] * d  # to the centre, along each ray
-        is_background = lengths(closest) > 1
-        is_background &= ~masked[first:first + len(d)]
-        background.append(rgb[first + np.flatnonzero(is_background)[::step]])
-    return dict(
+        pixel = scene["start"][i] + np.arange(len(d))
+        is_background = (lengths(closest) > 1) & ~masked[pixel]
+        background.append(rgb[pixel[is_background][::step]])
+    return scene | dict(
+        near=np.float32(near),
+        track_uv=np.concatenate(track_uv, dtype=np.float32),
         footprint=np.quantile(np.concatenate(sizes), 0.25),
         exposure_spread=brightness_spread(observed, brightness),
         bg_color=common_color(np.concatenate(background)))
 
 
 # ---- COLMAP models ---------------------------------------------------------------------
-# COLMAP's camera models in the order of their numbers, with their parameters.
-CAMERA_MODELS = dict(
-    SIMPLE_PINHOLE="f cx cy",
-    PINHOLE="fx fy cx cy",
-    SIMPLE_RADIAL="f cx cy k1",
-    RADIAL="f cx cy k1 k2",
-    OPENCV="fx fy cx cy k1 k2 p1 p2",
-    OPENCV_FISHEYE="fx fy cx cy k1 k2 k3 k4",
-    FULL_OPENCV="fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6",
-    FOV="fx fy cx cy omega",
-    SIMPLE_RADIAL_FISHEYE="f cx cy k",
-    RADIAL_FISHEYE="f cx cy k1 k2",
-    THIN_PRISM_FISHEYE="fx fy cx cy k1 k2 p1 p2 k3 k4 sx1 sy1",
-    RAD_TAN_THIN_PRISM_FISHEYE="fx fy cx cy k0 k1 k2 k3 k4 k5 p0 p1 s0 s1 s2 s3",
-    SIMPLE_DIVISION="f cx cy k",
-    DIVISION="fx fy cx cy k",
-    SIMPLE_FISHEYE="f cx cy",
-    FISHEYE="fx fy cx cy",
-    EUCM="fx fy cx cy alpha beta",
-    EQUIRECTANGULAR="w h",
-)
-PERSPECTIVE = "SIMPLE_PINHOLE PINHOLE SIMPLE_RADIAL RADIAL OPENCV FULL_OPENCV".split()
+# COLMAP's camera models: the numbers of their parameters, and what the perspective ones mean.
+PARAMETERS = [3, 4, 4, 5, 8, 8, 12, 5, 4, 5, 12, 16, 4, 5, 3, 4, 6, 2]
+PERSPECTIVE = {
+    0: "f cx cy",
+    1: "fx fy cx cy",
+    2: "f cx cy k1",
+    3: "f cx cy k1 k2",
+    4: "fx fy cx cy k1 k2 p1 p2",
+    6: "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6",
+}
 OPENCV_DISTORTION = "k1 k2 p1 p2 k3 k4 k5 k6".split()
 
 
-def open_binary(path):
-    """A function that reads the next values of a little-endian file, by struct's layouts."""
+def records(path):
+    """Yields, for each record of a COLMAP file, a function that reads values by a layout."""
     check(path.is_file(),
           f"{path} is missing: copy the whole model, or for points run "
           "colmap point_triangulator")
@@ -420,28 +400,27 @@ def open_binary(path):
 
     def read(layout):
         try:
-            record = struct.Struct("<" + layout)
+            record = struct.Struct("<" + layout)  # little-endian, without gaps
             return record.unpack(file.read(record.size))
         except struct.error as e:  # too few bytes are left, or the count is absurd
             message = f"{path} ends too early: copy it again, or delete its folder"
             raise UserError(message) from e
-    return read
+    (count,) = read("Q")
+    for _ in range(count):
+        yield read
 
 
 def read_cameras(sparse):
     """{number: (wh, K (4,), OPENCV_DISTORTION (8,))} of a model's perspective cameras."""
     cameras = {}
-    read = open_binary(sparse / "cameras.bin")
-    (count,) = read("Q")
-    for _ in range(count):
+    for read in records(sparse / "cameras.bin"):
         number, kind, *wh = read("IiQQ")
-        check(0 <= kind < len(CAMERA_MODELS),
+        check(0 <= kind < len(PARAMETERS),
               f"{sparse} has camera model {kind}, which is unknown: run "
               "colmap image_undistorter")
-        model, names = list(CAMERA_MODELS.items())[kind]
-        names = names.split()
-        value = dict(zip(names, read(f"{len(names)}d")))
-        if model in PERSPECTIVE:
+        numbers = read(f"{PARAMETERS[kind]}d")
+        if kind in PERSPECTIVE:
+            value = dict(zip(PERSPECTIVE[kind].split(), numbers))
             f = value.get("f")
             K = [value.get("fx", f), value.get("fy", f), value["cx"], value["cy"]]
             distortion = [value.get(name, 0.0) for name in OPENCV_DISTORTION]
@@ -453,9 +432,7 @@ def read_photos(sparse):
     """{name: (camera or None, pose (7,), ids of its points)} of a COLMAP model."""
     cameras = read_cameras(sparse)
     photos = {}
-    read = open_binary(sparse / "images.bin")
-    (count,) = read("Q")
-    for _ in range(count):
+    for read in records(sparse / "images.bin"):
         _, *pose, camera = read("I7dI")
         letters = iter(lambda: read("c")[0], b"\0")  # the name ends with a zero byte
         name = b"".join(letters).decode(errors="surrogateescape")
@@ -478,7 +455,9 @@ def check_photo(camera, pose, is_test):
     wh, K, distortion = camera
     numbers = np.concatenate([K, distortion, pose])
     is_sound = (abs(numbers) < MAX_NUMBER).all() and min(K[:2]) > EPSILON and pose[:4].any()
-    check(is_sound and max(wh) < 32767, "has no sound camera or pose: run SfM again")
+    check(is_sound, "has no sound camera or pose: run SfM again")
+    check(max(wh) < 32767,
+          f"is {wh[0]} x {wh[1]} pixels, too large for OpenCV: shrink it, then run SfM again")
     angle = 2 * np.degrees(np.arctan(max(wh / K[:2]) / 2))
     check(is_test or 10 <= angle <= 120,
           f"is {angle:.1f} degrees wide, which is not in 10..120")
@@ -495,9 +474,7 @@ def camera_to_world(pose):
 def read_points(sparse):
     """Points (P,5) of a COLMAP model, as in build_scene, and {id: row} of them."""
     points, rows = [], {}
-    read = open_binary(sparse / "points3D.bin")
-    (count,) = read("Q")
-    for _ in range(count):
+    for read in records(sparse / "points3D.bin"):
         point_id, x, y, z, *_, error, track_length = read("Q3d3BdQ")
         read(f"{2 * track_length}I")  # the track, skipped: photos list their points
         rows[point_id] = len(points)
@@ -511,35 +488,54 @@ def read_points(sparse):
 
 
 # ---- names and folders -----------------------------------------------------------------
-PHOTO_TYPES = (
+HEIC = rb"....ftyp(heic|heix|mif1|msf1)"  # how a file starts; phones often name it .jpg
+# A photo has one of these endings or starts. Some programs leave copies beside it.
+PHOTO_STARTS = rb"\xff\xd8\xff|\x89PNG|RIFF....WEBP|" + HEIC
+PHOTO_ENDINGS = tuple(
     ".jpg .jpeg .png .tif .tiff .bmp .webp .ppm .pgm .jp2 .avif .heic .heif".split())
+COPY_ENDINGS = ("~", "_original", ".bak", ".thm")
 
 
 def files_below(folder, levels=7):
     """Files at most so many levels down, without hidden folders and thumbnails.
 
-    Links are followed, unlike by rglob; broken ones are files.
+    Links are followed, unlike by rglob. A broken link counts as a file, and so does a
+    folder that may not be read.
     """
+    try:
+        paths = sorted(folder.iterdir()) if levels and folder.is_dir() else []
+    except PermissionError:
+        return [folder]
     files = []
-    if levels and folder.is_dir():
-        for path in sorted(folder.iterdir()):
-            if path.name.startswith((".", "@")):  # NAS boxes write @eaDir
-                continue
-            if path.is_dir():
-                files += files_below(path, levels - 1)
-            else:
-                files.append(path)
+    for path in paths:
+        if not path.name.startswith((".", "@")):  # NAS boxes write @eaDir
+            files += files_below(path, levels - 1) if os.path.isdir(path) else [path]
     return files
 
 
-def photo_files(folder):
-    """{name: path} of the photos below a folder, without masks/ and copies in dense/."""
+def starts_with(path, pattern):
+    """Whether a file can be read and its first bytes match."""
+    try:
+        with open(path, "rb") as file:
+            return bool(re.match(pattern, file.read(16), re.DOTALL))
+    except OSError:
+        return False
+
+
+def photo_files(folder, posed=()):
+    """{name: path} of the photos below a folder, without masks/ and copies in dense/.
+
+    A file that the model names is one of them, whatever its type.
+    """
     files = {}
     for path in files_below(folder):
-        name = path.relative_to(folder)
-        is_photo = path.suffix.lower() in PHOTO_TYPES
-        if is_photo and name.parts[0] not in ("dense", "masks"):
-            files[name.as_posix()] = path
+        name = path.relative_to(folder).as_posix()
+        ending = name.lower()
+        is_copy = name.startswith(("dense/", "masks/")) or ending.endswith(COPY_ENDINGS)
+        is_photo = not is_copy and (
+            ending.endswith(PHOTO_ENDINGS) or starts_with(path, PHOTO_STARTS))
+        if is_photo or name in posed:
+            files[name] = path
     return files
 
 
@@ -550,34 +546,30 @@ def mask_files(images, names):
         folder = images.parent / "masks"
     files = {path.relative_to(folder).as_posix(): path for path in files_below(folder)}
     masks = {}
-    for name in names:
-        other = str(PurePosixPath(name).with_suffix(".png"))
-        for candidate in (other, name + ".png", name):
-            if candidate in files:
-                masks[name] = files[candidate]
-                break
+    for pattern in ("{0.parent}/{0.stem}.png", "{0}.png", "{0}"):
+        wanted = {name: os.path.normpath(pattern.format(PurePosixPath(name))) for name in names}
+        found = match_names(wanted.values(), files)
+        for name in names:
+            if wanted[name] in found:
+                masks.setdefault(name, files[found[wanted[name]]])
     if files and not masks:
         warn(f"{folder} is not used: no name in it, such as {min(files)}, is a photo's")
     return masks
 
 
-def plain_name(name):
-    """A form that names share if they differ in case or Unicode form only."""
-    folded = unicodedata.normalize("NFC", name).casefold()
-    return unicodedata.normalize("NFC", folded)
-
-
 def match_names(wanted, there):
-    """{wanted name: its name there}: equal, or of equal plain_name if only one has it."""
+    """{wanted name: its name there}: equal, or alike if only one has it on each side.
+
+    Names that differ in case or Unicode form only are alike.
+    """
     found = {name: name for name in wanted if name in there}
-    ours, theirs = defaultdict(list), defaultdict(list)  # plain name: names
-    for name in set(wanted) - found.keys():
-        ours[plain_name(name)].append(name)
-    for name in set(there) - found.keys():
-        theirs[plain_name(name)].append(name)
-    for plain in ours.keys() & theirs.keys():
-        if len(ours[plain]) == 1 and len(theirs[plain]) == 1:
-            found[ours[plain][0]] = theirs[plain][0]
+    alike = defaultdict(lambda: ([], []))  # a form that they share: names of both sides
+    for side, names in enumerate([wanted, there]):
+        for name in set(names) - found.keys():
+            alike[unicodedata.normalize("NFC", name).casefold()][side].append(name)
+    for ours, theirs in alike.values():
+        if len(ours) == len(theirs) == 1:
+            found[ours[0]] = theirs[0]
     return found
 
 
@@ -597,7 +589,7 @@ def open_model(folder, sparse):
         places += [place / "images", place / "input", place]
         if place == folder:
             break
-    on_disk = [photo_files(place) for place in places]
+    on_disk = [photo_files(place, photos) for place in places]
     matches = [match_names(photos, files) for files in on_disk]
     best = max(range(len(places)), key=lambda i: len(matches[i]))
     files = {name: on_disk[best][other] for name, other in matches[best].items()}
@@ -620,6 +612,9 @@ def find_model(folder, command):
 
     command: how a model is made, for messages
     """
+    for path in files_below(folder):
+        if os.path.isdir(path):
+            warn(f"passed over: the folder {path} may not be read")
     models = [open_model(folder, sparse) for sparse in model_folders(folder)]
     if not models and folder.name in ("images", "input"):
         parent = Path(os.path.abspath(folder)).parent
@@ -657,87 +652,69 @@ def read_table(path):
 
 def split_files(folder, split):
     """The table of the split, or train_list.txt and test_list.txt: named or in the folder."""
-    tables = [
-        path for path in sorted(folder.glob("[!.]*.[ct]sv"))
-        if "split" in read_table(path)[0]
-    ]
-    if not tables:
-        tables = list(folder.glob("train*.txt"))
     if split:
-        tables = [Path(split)]
-    check(len(tables) < 2,
-          f"choose a split file by --split: {', '.join(map(str, tables))}")
-    if tables and tables[0].suffix == ".txt":
-        name = tables[0].name
-        tables = [
-            tables[0].with_name(re.sub("train|test", subset, name))
-            for subset in ("train", "test")
-        ]
-    return tables
+        found = [Path(split)]
+    else:
+        found = [
+            path for path in sorted(folder.glob("[!.]*.[ct]sv"))
+            if os.access(path, os.R_OK) and "split" in read_table(path)[0]
+        ] or list(folder.glob("train*.txt"))
+    check(len(found) < 2, f"choose a split file by --split: {', '.join(map(str, found))}")
+    if found and found[0].suffix == ".txt":
+        names = [re.sub("train|test", subset, found[0].name) for subset in ("train", "test")]
+        found = [found[0].with_name(name) for name in names]
+    return found
 
 
-def read_split(tables):
-    """{name: whether it is held out} of what split_files finds.
+def read_split(tables, names):
+    """{name: whether it is held out} of what split_files finds, with names as they are here.
 
     A table has NeRF-W's columns; rows with an empty id do not count.
     """
     path = tables[0]
+    print(f"split by {path}")
     if len(tables) == 2:
-        rows = [
-            dict(filename=words[0], split=subset)
-            for subset, names in zip(("train", "test"), tables)
-            for words in read_table(names)
+        head = ["filename", "split"]
+        lines = [
+            (words[0], subset)
+            for subset, table in zip(("train", "test"), tables)
+            for words in read_table(table)
         ]
     else:
         head, *lines = read_table(path)
-        check("filename" in head and "split" in head,
+        check({"filename", "split"} <= set(head),
               f"{path} needs a header with filename and split")
-        rows = [dict(zip(head, words)) for words in lines]
     is_held_out = {}
-    for row in rows:
-        if row.get("id") == "":
-            continue
-        name = row.get("filename")
-        subset = row.get("split")
+    for row in [dict(zip(head, line)) for line in lines]:
+        name, subset = row.get("filename"), row.get("split")
         is_test = subset == "test"
-        check(name and subset in ("train", "test") and is_held_out.get(name, is_test) == is_test,
-              f"{path}: {name!r} is {subset!r}; each is train or test, and not both")
-        is_held_out[name] = is_test
-    return is_held_out
-
-
-def choose_split(folder, names, tables):
-    """{name: whether it is held out} of the photos that are to be used; tells the rule."""
-    if not tables:
-        print(f"{folder} has no split file: every eighth photo is held out")
-        return {name: i % 8 == 7 for i, name in enumerate(names)}
-    print(f"split by {tables[0]}")
-    is_held_out = read_split(tables)
+        if row.get("id") != "":
+            is_clear = is_held_out.setdefault(name, is_test) == is_test
+            check(name and subset in ("train", "test") and is_clear,
+                  f"{path}: {name!r} is {subset!r}; each is train or test, and not both")
     matches = match_names(is_held_out, names)
     is_held_out = {matches.get(name, name): is_test for name, is_test in is_held_out.items()}
     rest = set(names) - is_held_out.keys()
     if rest:
-        warn(f"{len(rest)} photos are not in {tables[0]}: {min(rest)} ...")
+        warn(f"{len(rest)} photos are not in {path}: {min(rest)} ...")
     return is_held_out
 
 
 # ---- checksums -------------------------------------------------------------------------
-def checksum(paths, crc=0):
-    """CRC-32 over the content of the files that exist."""
-    for path in paths:
-        if path.is_file():
-            crc = zlib.crc32(path.read_bytes(), crc)
-    return crc
+def checksum(files, masks, sources=()):
+    """CRC-32 over the photos' names and content, their masks, and other sources' content.
 
-
-def photos_checksum(files, masks, crc=0):
-    """CRC-32 over the photos' names and content and their masks. files, masks: {name: path}"""
+    files, masks: {name: path}. A file that is missing or may not be read adds nothing.
+    """
+    named = [("", path) for path in sources]
     for name in sorted(files):
+        named += [(name, files[name]), ("", masks.get(name))]
+    crc = 0
+    for name, path in named:
         crc = zlib.crc32(os.fsencode(name), crc)
-        paths = [files[name]]
-        if name in masks:
-            paths.append(masks[name])
-        crc = checksum(paths, crc)
+        if path:
+            with contextlib.suppress(FileNotFoundError, PermissionError):
+                crc = zlib.crc32(path.read_bytes(), crc)
     return crc
 
 
@@ -745,48 +722,53 @@ def fingerprint(info):
     """CRC-32 over the content of all files that a scene is read from, wherever they lie."""
     folder = Path(info["folder"])
     images = Path(info["images"])
-    models = [
+    sources = [
         sparse / name
         for sparse in model_folders(folder)
         for name in ("cameras.bin", "images.bin", "points3D.bin")
     ]
-    there = photo_files(images)
-    files = {
-        name: there[other] for name, other in match_names(info["posed"], there).items()}
-    masks = mask_files(images, files)
-    crc = checksum([*models, *split_files(folder, info["split"])])
-    return photos_checksum(files, masks, crc)
-
-
-def is_fresh(info):
-    """Whether a scene's sources are unchanged, or gone: a scene file needs none of them."""
-    if not Path(info["folder"]).is_dir():
-        return True
-    return "posed" in info and info["files"] == fingerprint(info)
+    sources += split_files(folder, info["split"])
+    there = photo_files(images, set(info["posed"]))
+    matches = match_names(info["posed"], there)
+    files = {name: there[other] for name, other in matches.items()}
+    return checksum(files, mask_files(images, files), sources)
 
 
 # ---- photos and masks ------------------------------------------------------------------
-def is_heic(path):
-    """Whether a file is HEIC, by its content; phones often name it .jpg."""
-    with open(path, "rb") as file:
-        head = file.read(12)
-    return head[4:8] == b"ftyp" and head[8:] in (b"heic", b"heix", b"mif1", b"msf1")
+# Starts a segment of a JPEG or ends it; FF 00 is a byte of pixels, the others have no length.
+MARKER = re.compile(rb"\xff[\x02-\xcf\xd9-\xfe]")
 
 
 def is_cut_off(data):
-    """Whether a JPEG or PNG file lacks its end, which OpenCV does not report."""
-    if data[1:4] == b"PNG":
-        return b"IEND" not in data
-    last_scan = data.rfind(b"\xff\xda")
-    end_mark = data.rfind(b"\xff\xd9")
-    return data[:2] == b"\xff\xd8" and end_mark < last_scan
+    """Whether a JPEG or PNG file lacks its end, which OpenCV does not report.
+
+    A JPEG ends with its first end mark. A video or raw data may follow, and a segment
+    before it may hold a thumbnail with an end of its own.
+    """
+    if data[:2] != b"\xff\xd8":
+        return data[1:4] == b"PNG" and b"IEND" not in data
+    at = 2
+    while marker := MARKER.search(data, at):
+        at = marker.end()
+        if marker[0] == b"\xff\xd9":
+            return False
+        at += int.from_bytes(data[at:at + 2], "big")  # the segment's length
+    return True
+
+
+def is_memory_full(error):
+    """Whether an error of Python, numpy or OpenCV says so."""
+    says = ("Insufficient memory", "Failed to allocate")
+    return isinstance(error, MemoryError) or any(text in str(error) for text in says)
 
 
 def decode(data, flags):
     """The decoded image, or None."""
     try:
         return cv2.imdecode(np.frombuffer(data, np.uint8), flags)
-    except cv2.error:  # empty, or more than a gigapixel
+    except cv2.error as e:  # empty, or more than a gigapixel
+        if is_memory_full(e):
+            raise MemoryError("the memory is full: use smaller photos") from e
         return None
 
 
@@ -803,13 +785,12 @@ def undistort(image, camera):
     return image, np.array([P[0, 0], P[1, 1], P[0, 2] + 0.5, P[1, 2] + 0.5])
 
 
-def read_photo(path, camera, downscale):
-    """Reads, undistorts and downscales a photo. -> rgb uint8 (h,w,3), K (4,)"""
-    w, h = camera[0]
-    check(1 <= downscale <= min(w, h) / 2, f"is {w} x {h}: choose another --downscale")
-    check(path.is_file(), "is a broken link: copy the photo itself")
-    check(not is_heic(path), "is HEIC, which cannot be read: convert it to JPEG")
-    data = path.read_bytes()
+def read_photo(path, size):
+    """The photo (h,w,3) in uint8, BGR, as a camera of this size (w, h) saw it."""
+    w, h = size
+    check(path.exists(), "is a broken link: copy the photo itself")
+    check(not starts_with(path, HEIC), "is HEIC, which cannot be read: convert it to JPEG")
+    data = content(path)
     check(not is_cut_off(data), "is cut off: copy it again")
     image = decode(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     check(image is not None,
@@ -822,6 +803,13 @@ def read_photo(path, camera, downscale):
     check(size == (w, h),
           f"has {stored[0]} x {stored[1]} pixels{tag}, its camera {w} x {h}: put back what "
           "SfM saw")
+    return image
+
+
+def shrink_photo(image, camera, downscale):
+    """Undistorts and downscales a photo. -> rgb uint8 (h,w,3), K (4,)"""
+    w, h = camera[0]
+    check(1 <= downscale <= min(w, h) / 2, f"is {w} x {h}: choose another --downscale")
     image, K = undistort(image, camera)
     small = w // downscale, h // downscale
     image = cv2.resize(image, small, interpolation=cv2.INTER_AREA)
@@ -829,39 +817,68 @@ def read_photo(path, camera, downscale):
     return image[..., ::-1], K * np.tile(shrink, 2)  # fx, cx by width; fy, cy by height
 
 
-def read_mask(path, size):
-    """Reads a mask and scales it to its photo's size (w, h).
+def content(path):
+    """A file's bytes; UserError, a sentence about the file, where it cannot be read."""
+    try:
+        return path.read_bytes()
+    except OSError as e:
+        raise UserError(f"cannot be read: {e.strerror}") from e
 
-    -> uint8 (h,w): 0 is left out, 255 is not
+
+def read_alpha(path):
+    """The alpha channel (h,w) of a file, or None if all of it is opaque."""
+    data = content(path)
+    is_jpeg = data[:2] == b"\xff\xd8"
+    image = None if is_jpeg else decode(data, cv2.IMREAD_UNCHANGED)
+    if image is None or image.shape[2:] != (4,) or image.dtype.kind != "u":
+        return None
+    alpha = image[..., 3] / (np.iinfo(image.dtype).max / 255)
+    check((alpha >= 128).any(), "is transparent all over")
+    return alpha if (alpha < 128).any() else None
+
+
+def read_grey(path):
+    """A mask file's brightness (h,w), at most its alpha."""
+    grey = decode(content(path), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+    check(grey is not None, "is no image")
+    check((grey >= 128).any(), "is black all over; 255 is white")
+    alpha = read_alpha(path)
+    return grey if alpha is None else np.minimum(grey, alpha)
+
+
+def read_mask(photo, path, size):
+    """The mask of a photo by its mask file, if any, and its alpha channel, in size (w, h).
+
+    -> uint8 (h,w): 0 is left out, 255 is not; None without both. A bad mask is told.
     """
-    mask = decode(path.read_bytes(), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
-    check(mask is not None, "is no image")
-    mask = np.where(mask < 128, 0, 255).astype(np.uint8)
-    h, w = mask.shape
-    check(abs(w * size[1] / (h * size[0]) - 1) < 0.02,
-          f"has {w} x {h} pixels, its photo {size[0]} x {size[1]}")
-    check(mask.any(), "is black all over; 255 is white")
-    return cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST)
+    layers = []
+    for read, file in [(read_grey, path), (read_alpha, photo)]:
+        try:
+            layer = read(file) if file else None
+            if layer is not None:
+                h, w = layer.shape
+                check(abs(w * size[1] / (h * size[0]) - 1) < 0.02,
+                      f"has {w} x {h} pixels, its photo {size[0]} x {size[1]}")
+                layer = np.where(layer < 128, 0, 255).astype(np.uint8)
+                layers.append(cv2.resize(layer, size, interpolation=cv2.INTER_NEAREST))
+        except UserError as e:
+            warn(f"mask not used: {file} {e}")
+    return np.min(layers, axis=0) if layers else None
 
 
 def read_masks(model, usable):
     """The pixels that are left out of each usable photo: a list of (h,w) bool, or None."""
     paths = mask_files(model.images, usable)
-    masks = []
+    masks = [np.zeros(image.shape[:2], bool) for image, *_ in usable.values()]
     used = 0
-    for name, (image, *_) in usable.items():
-        h, w = image.shape[:2]
-        masked = np.zeros((h, w), bool)
-        if name in paths:
-            camera = model.photos[name][0]
-            try:
-                mask, _ = undistort(read_mask(paths[name], camera[0]), camera)
-                mask = cv2.resize(mask, (w, h), interpolation=cv2.INTER_AREA)
-                masked = mask < 128
-                used += 1
-            except UserError as e:
-                warn(f"mask not used: {paths[name]} {e}")
-        masks.append(masked)
+    for i, name in enumerate(usable):
+        camera = model.photos[name][0]
+        mask = read_mask(model.files[name], paths.get(name), camera[0])
+        if mask is not None:
+            mask, _ = undistort(mask, camera)
+            size = masks[i].shape[::-1]
+            masks[i] = cv2.resize(mask, size, interpolation=cv2.INTER_AREA) < 128
+            used += 1
     if not used:
         return None
     black = np.mean(np.concatenate([masked.ravel() for masked in masks]))
@@ -874,17 +891,21 @@ def read_masks(model, usable):
 def read_usable(model, points, rows, is_held_out, downscale):
     """{name: (rgb, K, c2w, rows of its points)} of the photos that can be used.
 
-    Tells which cannot, and why.
+    Prints which cannot, and why. Of photos with the same pixels one is used for training,
+    or none if one of them is held out.
     """
     usable = {}
     misfits = {}  # photos that miss most of the points that they should see
+    pixels = {}  # hashes
     for name in progress(sorted(is_held_out), "preparing photos"):
         try:
             check(name in model.photos, f"has no pose{name_hint(name, model.files)}")
             check(name in model.files, f"is not on disk{name_hint(name, model.on_disk)}")
             camera, pose, ids = model.photos[name]
             check_photo(camera, pose, is_held_out[name])
-            image, K = read_photo(model.files[name], camera, downscale)
+            image = read_photo(model.files[name], camera[0])
+            pixels[name] = hashlib.sha256(image).digest()
+            image, K = shrink_photo(image, camera, downscale)
         except UserError as e:
             warn(f"left out: {name} {e}")
             continue
@@ -902,6 +923,12 @@ def read_usable(model, points, rows, is_held_out, downscale):
         warn(f"left out: {name} shows {share:.0%} of its points: its pose or its distortion "
              "is wrong")
         del usable[name]
+    first = {}  # the photo that is used, by its pixels
+    for name in sorted(usable, key=lambda name: not is_held_out[name]):
+        twin = first.setdefault(pixels[name], name)
+        if twin != name and not is_held_out[name]:
+            warn(f"left out: {name} is the same photo as {twin}")
+            del usable[name]
     lost = [name for name in is_held_out if is_held_out[name] and name not in usable]
     check(not lost,
           f"held-out photos cannot be used, repair them or hold out others: {lost}")
@@ -909,6 +936,54 @@ def read_usable(model, points, rows, is_held_out, downscale):
     check(count >= 2,
           f"{count} usable training photos are too few: repair them or the split file")
     return usable
+
+
+def check_sphere(scene):
+    """Prints size and content of the sphere; UserError if points and poses disagree."""
+    spread = [
+        np.std(scene["track_uv"][scene["track_photo"] == i], axis=0).max()
+        for i in np.unique(scene["track_photo"])
+    ]
+    check(np.median(spread) > 0.02,
+          "the points of a photo lie on one spot of it: give poses in the units of the points")
+    inside = (lengths(scene["points"]) < 1).mean()
+    print(f"the sphere has a radius of {scene['scale']:.3g} units of the reconstruction; "
+          f"{inside:.0%} of the points are inside")
+    place, forward = scene["c2w"][:, :, 3], scene["c2w"][:, :, 2]
+    looks_out = (lengths(place) < 1) & ((place * forward).sum(1) > 0)  # the centre is behind
+    if looks_out.mean() > 0.3:
+        warn(f"{looks_out.sum()} of {len(place)} cameras look outwards from within the sphere, as "
+             "in a room: expect poor geometry; this method is for a landmark seen from outside")
+
+
+def read_folder(folder, command, downscale, split):
+    """The scene of a folder; command: how a model is made, for messages."""
+    model = find_model(folder, command)
+    info = dict(
+        scene=folder.resolve().name,
+        kind="colmap",
+        downscale=downscale,
+        folder=str(folder),
+        images=str(model.images),
+        posed=sorted(model.photos),
+        split=split)
+    info["files"] = fingerprint(info)
+    tables = split_files(folder, split)
+    is_held_out = dict.fromkeys(model.files, False)
+    if tables:
+        is_held_out = read_split(tables, model.files)
+    points, rows = read_points(model.sparse)
+    usable = read_usable(model, points, rows, is_held_out, downscale)
+    if not tables:
+        print(f"{folder} has no split file: every eighth photo is held out")
+        is_held_out = {name: i % 8 == 7 for i, name in enumerate(usable)}
+    masks = read_masks(model, usable)
+    images, K, c2w, tracks = zip(*usable.values())
+    is_test = [is_held_out[name] for name in usable]
+    scene = build_scene(
+        images, K, c2w, is_test, list(usable), points, tracks, info, masks=masks)
+    check_sphere(scene)
+    return scene
 
 
 def prepare(name, downscale=2, split=None):
@@ -920,56 +995,38 @@ def prepare(name, downscale=2, split=None):
         command = f"python data_prep.py {name} --download"
         if not folder.is_dir():
             folder = DATA / SCENES[name][0]
-    model = find_model(folder, command)
-    split = os.path.abspath(split) if split else None
-    info = dict(
-        scene=folder.resolve().name,
-        kind="colmap",
-        downscale=downscale,
-        folder=str(folder),
-        images=str(model.images),
-        posed=sorted(model.photos),
-        split=split)
-    info["files"] = fingerprint(info)
-    tables = split_files(folder, split)
-    is_held_out = choose_split(folder, sorted(model.files), tables)
-    points, rows = read_points(model.sparse)
-    usable = read_usable(model, points, rows, is_held_out, downscale)
-    masks = read_masks(model, usable)
-    images, K, c2w, tracks = zip(*usable.values())
-    is_test = [is_held_out[name] for name in usable]
-    scene = build_scene(
-        images, K, c2w, is_test, list(usable), points, tracks, info, masks=masks)
-    spread = [
-        np.std(scene["track_uv"][scene["track_photo"] == i], axis=0).max()
-        for i in np.unique(scene["track_photo"])
-    ]
-    check(np.median(spread) > 0.02,
-          "the points of a photo lie on one spot of it: give poses in the units of the points")
-    inside = (lengths(scene["points"]) < 1).mean()
-    print(f"the sphere has a radius of {scene['scale']:.3g} units of the reconstruction; "
-          f"{inside:.0%} of the points are inside")
-    return scene
+    try:
+        return read_folder(folder, command, downscale, split and os.path.abspath(split))
+    except (MemoryError, cv2.error) as e:
+        if not is_memory_full(e):
+            raise
+        message = f"the memory is full: use a larger --downscale than {downscale}"
+        raise UserError(message) from e
 
 
 def scene_path(name_or_folder):
     """data/<scene>.npz; folders get a suffix, so that two of one name do not share a file."""
     folder = Path(name_or_folder).resolve()
-    mark = ""
-    if name_or_folder not in ("toy", *SCENES):
-        mark = f"-{zlib.crc32(os.fsencode(folder)):08x}"
-    return DATA / f"{folder.name}{mark}.npz"
+    is_known = name_or_folder in ("toy", *SCENES)
+    mark = "" if is_known else f"-{zlib.crc32(os.fsencode(folder)):08x}"
+    return DATA / f"{folder.name[:50]}{mark}.npz"  # a file's name has 255 bytes at most
 
 
 def open_scene(name_or_folder, downscale=2):
-    """Scene from its file: made on first use, and anew if the content of a source differs."""
+    """Scene from its file: made on first use, and anew if the content of a source differs.
+
+    Where the sources are gone the file is all that is needed.
+    """
     path = scene_path(name_or_folder)
     split = None
     if path.exists():
         scene = read_scene(path)
         info = json.loads(str(scene["info"]))
         split = info["split"]  # named once, by --split
-        if info["kind"] == "toy" or (info["downscale"] == downscale and is_fresh(info)):
+        if info["kind"] == "toy":
+            return scene
+        is_gone = not os.path.isdir(info["folder"])
+        if info["downscale"] == downscale and (is_gone or info["files"] == fingerprint(info)):
             return scene
     print(f"making {path}")
     if name_or_folder == "toy":
@@ -1501,11 +1558,11 @@ def sfm_photos(images):
     """{name: path} of raw photos, all of which pycolmap can read."""
     files = photo_files(images)
     for name, path in list(files.items()):
-        if not path.is_file():
-            warn(f"left out: {name} is a broken link")
+        if not starts_with(path, b"."):
+            warn(f"left out: {name} is empty, a broken link or may not be read")
             del files[name]
-    check(files, f"{images} has no photos: name the folder that holds them")
-    heic = [name for name, path in files.items() if is_heic(path)]
+    check(files, f"{images} has no photos of a known type: name the folder that holds them")
+    heic = [name for name, path in files.items() if starts_with(path, HEIC)]
     check(not heic,
           f"{len(heic)} photos are HEIC, such as {heic[:1]}, which cannot be read: convert "
           "them to JPEG")
@@ -1517,18 +1574,16 @@ def sfm_photos(images):
 
 def write_sfm_masks(files, masks, folder):
     """Writes masks in the photos' sizes under COLMAP's names, photo.jpg.png."""
-    for name, path in masks.items():
-        photo = decode(
-            files[name].read_bytes(), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-        check(photo is not None, f"{files[name]} is damaged: replace it")
-        try:
-            mask = read_mask(path, photo.shape[1::-1])
-        except UserError as e:
-            warn(f"mask not used: {path} {e}")
+    for name, path in progress(files.items(), "looking for masks"):
+        photo = decode(path.read_bytes(), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+        if photo is None:
+            warn(f"{name} cannot be read, it is damaged or too large: replace it")
             continue
-        target = folder / f"{name}.png"
-        target.parent.mkdir(parents=True, exist_ok=True)
-        target.write_bytes(cv2.imencode(".png", mask)[1].tobytes())
+        mask = read_mask(path, masks.get(name), photo.shape[1::-1])
+        if mask is not None:
+            target = folder / f"{name}.png"
+            target.parent.mkdir(parents=True, exist_ok=True)
+            target.write_bytes(cv2.imencode(".png", mask)[1].tobytes())
 
 
 def import_pycolmap():
@@ -1556,26 +1611,30 @@ def run_sfm(folder):
     files = sfm_photos(images)
     masks = mask_files(images, files)
     pycolmap = import_pycolmap()
-    work = DATA / f"sfm-{photos_checksum(files, masks):08x}"
-    work.mkdir(parents=True, exist_ok=True)
+    work = DATA / f"sfm-{checksum(files, masks):08x}"
     database = work / "database.db"
     reader = pycolmap.ImageReaderOptions()
-    if masks:
-        write_sfm_masks(files, masks, work / "masks")
-        reader.mask_path = work / "masks"
+    (work / "masks").mkdir(parents=True, exist_ok=True)
+    write_sfm_masks(files, masks, work / "masks")
+    reader.mask_path = work / "masks"
     # Of 135 photos of a statue in all lights these options pose 104 in one model, not 60.
     features = pycolmap.FeatureExtractionOptions()
     features.sift.estimate_affine_shape = True
     features.sift.domain_size_pooling = True
     matching = pycolmap.FeatureMatchingOptions()
     matching.guided_matching = True
-    pycolmap.extract_features(
-        database, images, sorted(files), reader_options=reader, extraction_options=features)
-    pycolmap.match_exhaustive(database, matching_options=matching)
     with tempfile.TemporaryDirectory(prefix=".sparse", dir=folder) as temporary:
         models = Path(temporary, "models")
         models.mkdir()
-        found = pycolmap.incremental_mapping(database, images, models)
+        try:
+            pycolmap.extract_features(
+                database, images, sorted(files), reader_options=reader,
+                extraction_options=features)
+            pycolmap.match_exhaustive(database, matching_options=matching)
+            found = pycolmap.incremental_mapping(database, images, models)
+        except (RuntimeError, ValueError) as e:
+            message = f"pycolmap failed ({e}): delete {work}, which may be damaged, and retry"
+            raise UserError(message) from e
         check(found,
               f"the photos in {folder} do not match each other; take more, with more overlap")
         models.rename(sparse)
@@ -1601,9 +1660,7 @@ def main(argv=None):
     allow_any_character()
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C
     given = vars(parser.parse_args(argv))
-    name = given.pop("scene")
-    is_download = given.pop("download", False)
-    is_sfm = given.pop("sfm", False)
+    name, is_download, is_sfm = [given.pop(key, None) for key in ("scene", "download", "sfm")]
     path = scene_path(name)
     allowed = knobs if name == "toy" else ("downscale", "split")
     wrong = given.keys() - allowed
@@ -1616,7 +1673,8 @@ def main(argv=None):
         scene = make_toy(**given) if name == "toy" else prepare(name, **given)
         write_scene(path, scene)
     except (UserError, OSError, MemoryError, KeyboardInterrupt) as e:
-        warn(f"error: {str(e) or 'stopped; start again'}")
+        reason = "the memory is full" if is_memory_full(e) else "stopped; start again"
+        warn(f"error: {str(e) or reason}")
         sys.exit(2)
     print(f"{path}: {len(scene['wh'])} photos, {scene['is_test'].sum()} of them for testing")
 

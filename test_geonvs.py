@@ -272,6 +272,13 @@ def test_a_failed_write_leaves_the_old_file(tmp_path):
     assert os.listdir(path.parent) == ["scene.npz"]
 
 
+def test_a_name_may_have_255_bytes(in_tmp_dir):
+    path = Path("x" * 251 + ".png")
+    data_prep.atomic_write(path, lambda part: part.write_text("whole"))
+    assert os.listdir() == [path.name]
+    data_prep.write_scene(data_prep.scene_path("é" * 127), toy())
+
+
 # ---- the sphere ----------------------------------------------------------------------------------
 def ball(count):
     """Random points of the unit ball (count,3)"""
@@ -348,6 +355,18 @@ def test_points_of_few_views_or_large_errors_go(count, kept):
 def test_points_without_a_sphere_are_an_error(xyz, held_out, says):
     with pytest.raises(UserError, match=says):
         scene_of_points(xyz, is_test=[held_out] * 3)
+
+
+@pytest.mark.parametrize("masked_photos, share", [(1, 1), (2, .5)])
+def test_points_that_most_photos_mask_are_not_there(masked_photos, share):
+    xyz = np.random.default_rng(0).uniform((-8, -8, 8), (0, 0, 8), (600, 3))
+    masks = np.zeros((3, 20, 20), bool)
+    masks[:masked_photos, :, :10] = True  # where x < -4
+    scene = scene_of_points(xyz, masks=list(masks))
+    x = world(scene, scene["points"])[:, 0]
+    assert (x.min() > -4.01) == (share < 1)
+    assert abs(len(x) / 600 - share) < .06
+    assert len(scene["track_photo"]) == 3 * len(x)
 
 
 def test_near_footprint_and_sightings_follow_the_points():
@@ -517,6 +536,21 @@ def test_equal_names_go_before_alike_ones(wanted, there, found):
     assert data_prep.match_names(wanted.split(), there.split()) == found
 
 
+def test_a_photo_is_known_by_its_content(model):
+    names = ["a.jfif", "a.mpo", "a", "a.JPG_large", "a.PNG"]
+    for name in names:
+        put(IMAGES / name, encoded(BLACK, ".jpg"))
+    for name in ("a.jpg_original", "a.jpg~", "a.THM", ".a.jpg"):  # copies
+        put(IMAGES / name, encoded(BLACK, ".jpg"))
+    put(IMAGES / "a.dng", encoded(BLACK, ".tiff"))  # raw
+    put(IMAGES / "a.txt", "text")
+    model.names[:5] = names
+    write_model(model)
+    found = data_prep.photo_files(IMAGES)
+    assert found.keys() == {*names, *toy()["name"]}
+    assert data_prep.find_model(Path("place"), "").count == 8
+
+
 def test_the_largest_model_is_taken_and_leftovers_told(model):
     shutil.copy(PHOTO, IMAGES / "more.JPG")
     put(MASKS / "other.png", encoded(BLACK + 255))
@@ -546,7 +580,9 @@ def test_the_cameras_of_photos_shrink_with_them(model):
 
 @cases(
     "kind, focal, distortion",
+    simple_pinhole=(0, [70], []),
     simple_radial=(2, [70], [.2]),
+    radial=(3, [70], [.2, .05]),
     opencv=(4, [70, 72], [.1, 0, .01, -.01]),
     full_opencv=(6, [70, 72], [.1, 0, .01, -.01, 0, 0, 0, .5]))
 def test_distorted_photos_agree_with_their_camera(model, kind, focal, distortion):
@@ -558,7 +594,7 @@ def test_distorted_photos_agree_with_their_camera(model, kind, focal, distortion
     write_model(model)
     scene = data_prep.prepare("place", 1)
     d = data_prep.ray_directions(scene["K"][0], np.eye(3), 90, 60)
-    padded = np.append(distortion, np.zeros(7))[:8]
+    padded = np.append(distortion, np.zeros(8))[:8]
     xy, _ = cv2.projectPoints(d, np.zeros(3), np.zeros(3), np.eye(3), padded)
     uv = xy[:, 0] * focal + (44, 31)
     miss = photo(scene, 0)[..., 0].ravel() - uv @ (1, 2)
@@ -680,6 +716,7 @@ def dangle(model):
     tiny_focal=(change("cameras", 0, [1, 24, 32, 30, 1e-300, 2, 1]), "no sound camera or pose"),
     infinite=(change("cameras", 0, [1, 24, 32, 30, 30, np.inf, 1]), "no sound camera or pose"),
     no_camera=(change("camera_ids", 0, 12345), "no camera in the model"),
+    panorama=(change("cameras", 0, [1, 33000, 9, 99, 99, 9, 9]), "is 33000 x 9 pixels, too large"),
     wrong_pose=(change("poses", (0, 4), 99), "shows 0% of its points"),
     folding=(change("cameras", 0, [2, 24, 32, 26, 12, 16, 300]), "its pose or its distortion"),
     empty=(new(PHOTO, b""), "is empty, damaged, too large or no photo"),
@@ -703,12 +740,109 @@ def test_what_cannot_be_used_is_named(model, spoil, says):
     assert "masked" not in scene
 
 
+def test_a_photo_of_an_unknown_type_is_named(model):
+    PHOTO.rename(IMAGES / "toy_000.dng")
+    put(IMAGES / "toy_000.dng", "raw data")
+    change("names", 0, "toy_000.dng")(model)
+    TABLE.unlink()
+    scene, out, err = made()
+    assert "8 photos on disk, 8 posed" in out
+    assert err.startswith("left out: toy_000.dng is empty, damaged, too large or no photo")
+
+
 def test_bad_photos_are_found_in_one_go(model):
     change("poses", [0, 4, 6], np.nan)(model)
     code, out, err = run_main("place")
     assert code == 2
     assert re.findall("left out: (.*).png has", err) == ["toy_000", "toy_004", "toy_006"]
     assert err.endswith("repair them or hold out others: ['toy_006.png']\n")
+
+
+def segment(mark, content):
+    return bytes([255, mark]) + struct.pack(">H", len(content) + 2) + content
+
+
+@pytest.mark.parametrize("progressive", [0, 1])
+def test_a_jpeg_ends_with_its_first_end_mark(progressive):
+    image = np.random.default_rng(0).integers(0, 255, (40, 50, 3))
+    options = [cv2.IMWRITE_JPEG_PROGRESSIVE, progressive, cv2.IMWRITE_JPEG_RST_INTERVAL, 2]
+    jpeg = cv2.imencode(".jpg", np.uint8(image), options)[1].tobytes()
+    whole = jpeg[:2] + segment(0xe1, b"Exif" + jpeg) + jpeg[2:]  # with a thumbnail
+    for rest in (b"", b"\0" * 9, jpeg[:99], b"ftypmp42" + segment(0xda, b"raw")):
+        assert not data_prep.is_cut_off(whole + rest)
+    assert all(data_prep.is_cut_off(whole[:size]) for size in range(2, len(whole)))
+
+
+def repeat(model, first, second):
+    """The second photo becomes a copy of the first."""
+    for column in (model.cameras, model.poses, model.sightings):
+        column[second] = column[first]
+    content = Path(IMAGES, model.names[first]).read_bytes()
+    put(IMAGES / model.names[second], content)
+    write_model(model)
+
+
+@cases(
+    "first, second, has_table, told, used",
+    training=(0, 1, True, "toy_001.png is the same photo as toy_000.png", 7),
+    held_out=(0, 2, True, "toy_000.png is the same photo as toy_002.png", 7),
+    both_held_out=(2, 6, True, "", 8),
+    automatic=(0, 2, False, "toy_002.png is the same photo as toy_000.png", 7))
+def test_a_photo_is_on_one_side_of_the_split(model, first, second, has_table, told, used):
+    repeat(model, first, second)
+    if not has_table:
+        TABLE.unlink()
+    scene, out, err = made()
+    assert err == (told and f"left out: {told}\n")
+    assert len(scene["name"]) == used
+
+
+def test_the_automatic_split_holds_out_photos_that_can_be_used(in_tmp_dir):
+    write_folder(toy(photos=8))
+    TABLE.unlink()
+    put(IMAGES / "toy_007.png", "no photo")
+    scene, out, err = made()
+    assert scene["name"][scene["is_test"]].tolist() == ["toy_008.png"]
+    assert "left out: toy_007.png" in err
+
+
+@cases(
+    "module, function, error",
+    read=(cv2, "imdecode", cv2.error("(-4:Insufficient memory) Failed to allocate 9 bytes")),
+    shrink=(cv2, "resize", cv2.error("(-4:Insufficient memory) Failed to allocate 9 bytes")),
+    join=(np, "concatenate", MemoryError()))
+def test_a_full_memory_is_no_damaged_photo(model, monkeypatch, module, function, error):
+    monkeypatch.setattr(module, function, mock.Mock(side_effect=error))
+    assert_error("the memory is full: use a larger --downscale than 2", "place")
+
+
+def refuse(function, path):
+    """A function that may not touch a path."""
+    def call(self, *args):
+        if self == path:
+            raise PermissionError(13, "Permission denied", str(path))
+        return function(self, *args)
+    return call
+
+
+def test_what_may_not_be_read_is_passed_over(model, monkeypatch):
+    lost = Path("place/lost+found")
+    lost.mkdir()
+    monkeypatch.setattr(Path, "iterdir", refuse(Path.iterdir, lost))
+    monkeypatch.setattr(Path, "read_bytes", refuse(Path.read_bytes, PHOTO))
+    scene, out, err = made()
+    assert len(scene["name"]) == 7
+    assert err.splitlines() == [
+        "passed over: the folder place/lost+found may not be read",
+        "left out: toy_000.png cannot be read: Permission denied"]
+
+
+@pytest.mark.parametrize("ahead, is_room", [(.5, True), (-.5, False), (1.5, False)])
+def test_cameras_that_look_out_of_the_sphere_are_told(ahead, is_room, capsys):
+    c2w = toy()["c2w"].copy()
+    c2w[:, :, 3] = ahead * c2w[:, :, 2]  # so far from the centre, in the direction of the view
+    data_prep.check_sphere(toy() | dict(c2w=c2w))
+    assert ("8 of 8 cameras look outwards" in capsys.readouterr().err) == is_room
 
 
 @pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin"])
@@ -856,6 +990,7 @@ BLACK_LEFT = np.repeat([[0, 255]], 24, 1)[[0] * 64]  # twice as large as the pho
 @pytest.mark.parametrize("name, mask_name", [
     ("toy_000.png", "toy_000.png"),
     ("toy_000.jpg", "toy_000.png"),
+    ("toy_000.JPG", "TOY_000.PNG"),
     ("toy_000.jpg", "toy_000.jpg.png"),
     ("toy_000.jpg", "toy_000.jpg")])
 def test_black_pixels_of_masks_are_left_out(model, folder, name, mask_name):
@@ -871,6 +1006,36 @@ def test_black_pixels_of_masks_are_left_out(model, folder, name, mask_name):
     assert scene["masked"].sum() == 16 * 6
     assert "every eighth photo" in out
     assert scene["is_test"].tolist() == [False] * 7 + [True]
+
+
+def with_alpha(kind, dtype=np.uint8):
+    """A photo of 24 x 32 pixels whose upper quarter is transparent."""
+    image = np.full((32, 24, 4), np.iinfo(dtype).max, dtype)
+    image[:8, :, 3] //= 3
+    return cv2.imencode(kind, image)[1].tobytes()
+
+
+@cases(
+    "file, share",
+    png=(with_alpha(".png"), 1 / 4),
+    png_of_16_bits=(with_alpha(".png", np.uint16), 1 / 4),
+    tiff=(with_alpha(".tiff"), 1 / 4),
+    webp=(with_alpha(".webp"), 1 / 4),
+    opaque=(encoded(np.full((32, 24, 4), 255)), 0),
+    transparent=(encoded(np.zeros((32, 24, 4))), 0))
+def test_an_alpha_channel_is_a_mask(model, file, share):
+    put(PHOTO, file)
+    scene, out, err = made("--downscale 1")
+    assert ("1 of 8 photos have a mask" in out) == (share > 0)
+    assert scene.get("masked", np.zeros(1)).sum() == share * 32 * 24
+
+
+def test_mask_and_alpha_are_joined(model):
+    put(PHOTO, with_alpha(".png"))
+    put(MASKS / "toy_000.png", encoded(BLACK_LEFT))
+    masked = photo(made("--downscale 1")[0], 0, "masked")
+    assert np.array_equal(masked, masked[-1] | masked[:, -1:])
+    assert masked.mean() == 1 / 4 + 1 / 2 - 1 / 8
 
 
 # ---- the toy -------------------------------------------------------------------------------------
@@ -1182,10 +1347,38 @@ def test_a_second_sfm_takes_up_the_first(pycolmap):
     assert second[1]["reader_options"].mask_path == mask.parent
 
 
+def test_sfm_leaves_out_transparent_pixels(pycolmap):
+    put(PHOTO, with_alpha(".png"))
+    pycolmap.incremental_mapping.side_effect = OSError(28, "No space left")
+    assert_error("No space left", "place --sfm")
+    (mask,) = Path("data").rglob("masks/*")
+    assert mask.name == "toy_000.png.png"
+    assert (cv2.imread(str(mask), cv2.IMREAD_GRAYSCALE) == 0).mean() == 1 / 4
+
+
+def test_renamed_photos_are_matched_anew(model):
+    first, second = Path("place/images/toy_000.png"), Path("place/images/toy_001.png")
+    sums = [data_prep.checksum({name: first}, masks) for name, masks in [
+        ("a.png", {}), ("b.png", {}), ("a.png", {"a.png": second})]]
+    assert len(set(sums)) == 3
+
+
+def test_sfm_asks_for_its_place_first(pycolmap, monkeypatch):
+    no_place = mock.Mock(side_effect=OSError(30, "Read-only file system", "place"))
+    monkeypatch.setattr(data_prep.tempfile, "TemporaryDirectory", no_place)
+    assert_error("Read-only file system: 'place'", "place --sfm")
+    pycolmap.extract_features.assert_not_called()
+
+
+def fail(function, error):
+    return lambda model: setattr(sys.modules["pycolmap"], function, mock.Mock(side_effect=error))
+
+
 @cases(
     "spoil, says",
     has_model=(new(SPARSE / "0/images.bin"), "place has sparse/ or dense/, a model: leave --sfm"),
     no_photos=(move(IMAGES), "place has no photos"),
+    damaged=(fail("extract_features", RuntimeError("no table")), "(no table): delete data/sfm"),
     heic=(new(IMAGES / "phone.jpg", HEIC), "1 photos are HEIC, such as ['phone.jpg']"),
     no_utf8=(move(PHOTO, IMAGES / "\udcff.png"), "is not UTF-8: rename the photo"),
     no_pycolmap=(lambda model: sys.modules.update(pycolmap=None), 'run pip install "pycolmap>='),
@@ -1228,6 +1421,7 @@ def test_misspelt_commands_exit_with_2(model, command):
     "happens, says",
     ctrl_c=(KeyboardInterrupt, "stopped"),
     sigterm=(lambda **knobs: signal.raise_signal(signal.SIGTERM), "stopped"),
+    full_memory=(MemoryError(), "the memory is full"),
     full_disk=(OSError(28, "No space left"), "No space left"))
 def test_a_stop_is_one_sentence(in_tmp_dir, monkeypatch, happens, says):
     make_toy = mock.create_autospec(data_prep.make_toy, side_effect=happens)
