@@ -261,14 +261,10 @@ def find_sphere(x, weight, tracks, is_test, contain):
     return center, radius
 
 
-def mostly_masked(x, K, c2w, wh, tracks, masks):
-    """Which points x (P,3) have more than half of their sightings in masked pixels. -> (P,)"""
-    seen, hidden = np.zeros((2, len(x)))
-    for i, mask in enumerate(masks or ()):
-        uv, _ = project(K[i], c2w[i], x[tracks[i]])
-        seen[tracks[i]] += 1
-        hidden[tracks[i]] += np.ravel(mask)[pixel_index(uv, wh[i])]
-    return 2 * hidden > seen
+def unmasked(track, mask, K, c2w, x):
+    """The indices track (M,) of points x (P,3) but those seen in masked pixels. mask (h,w)"""
+    uv, _ = project(K, c2w, x[track])
+    return track[~mask.ravel()[pixel_index(uv, mask.shape[::-1])]]
 
 
 def build_scene(
@@ -276,11 +272,17 @@ def build_scene(
     """The scene of images (h,w,3), each of which sees the points tracks (M,).
 
     SfM units: c2w; points (P,5): x y z, error [px], track length; contain (...,3).
-    masks: of each photo (h,w) bool, True is left out.
+    masks: of each photo (h,w) bool, True is left out, and with it what is seen there: a
+    point is dropped if more than half of its sightings are.
     """
     error, track_length = points[:, 3:].T
     wh = np.array([image.shape[1::-1] for image in images])
-    is_there = ~mostly_masked(points[:, :3], K, c2w, wh, tracks, masks)
+    seen = np.bincount(np.concatenate(tracks), minlength=len(points))
+    if masks:
+        x = points[:, :3]
+        tracks = [unmasked(*row, x) for row in zip(tracks, masks, K, c2w)]
+    left = np.bincount(np.concatenate(tracks), minlength=len(points))
+    is_there = 2 * left >= seen
     usable = is_there & (track_length >= 3)
     if usable.sum() < 500:
         usable = is_there & (track_length >= 2)
@@ -360,9 +362,8 @@ def add_statistics(scene):
             continue
         sizes.append(distance[lengths(x) < 1] / K[0])
         pixel = scene["start"][i] + pixel_index(uv, wh)
-        is_seen = ~masked[pixel]
-        observed.append(track[is_seen])
-        brightness.append(rgb[pixel[is_seen]].mean(1) / 255)
+        observed.append(track)
+        brightness.append(rgb[pixel].mean(1) / 255)
         o = c2w[:, 3]
         d = ray_directions(K, c2w, *wh)
         closest = o - np.minimum(d @ o, 0)[:, None] * d  # to the centre, along each ray
