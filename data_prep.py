@@ -16,6 +16,7 @@ photo.png, photo.jpg.png or photo.jpg. Pixels darker than 128 are left out.
 Functions raise UserError, one sentence that says what to do.
 """
 import argparse
+import contextlib
 import difflib
 import gzip
 import inspect
@@ -30,6 +31,7 @@ import struct
 import sys
 import tarfile
 import tempfile
+import threading
 import time
 import unicodedata
 import zipfile
@@ -106,6 +108,33 @@ def allow_any_character():
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):  # a notebook's streams print any character
             stream.reconfigure(errors="backslashreplace")
+
+
+@contextlib.contextmanager
+def on_signals(handler):
+    """Ctrl-C, SIGTERM and SIGHUP (a closed terminal) call a handler meanwhile, in the main thread.
+    A signal that is ignored, as nohup does, stays ignored."""
+    old = {}
+    for name in ("SIGINT", "SIGTERM", "SIGHUP"):
+        number = getattr(signal, name, None)  # Windows has no SIGHUP
+        is_main = threading.current_thread() is threading.main_thread()
+        if number and is_main and signal.getsignal(number) != signal.SIG_IGN:
+            old[number] = signal.signal(number, handler)
+    try:
+        yield
+    finally:
+        for number, former in old.items():
+            signal.signal(number, former)
+
+
+MEMORY_FULL = "allocat|out of memory|ALLOC_FAILED|_NOT_INITIALIZED|nsufficient memory"
+
+
+def is_memory_full(error):
+    """Whether an error of Python, OpenCV, a CPU's allocator, CUDA, cuBLAS or cuDNN says so."""
+    if isinstance(error, (RuntimeError, cv2.error)):
+        return re.search(MEMORY_FULL, str(error)) is not None
+    return isinstance(error, MemoryError)
 
 
 def progress(items, what):

@@ -62,14 +62,12 @@ import io
 import json
 import math
 import os
-import re
 import shutil
 import signal
 import statistics
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 import zlib
 from dataclasses import dataclass, field, fields, replace
@@ -86,7 +84,8 @@ from skimage.metrics import structural_similarity
 from torch import Tensor, nn
 
 import data_prep
-from data_prep import UserError, atomic_write, check, progress, write_ply, write_png
+from data_prep import (
+    UserError, atomic_write, check, is_memory_full, on_signals, progress, write_ply, write_png)
 
 # distances need float32: TF32 would drown finite differences in rounding errors
 torch.set_float32_matmul_precision("highest")
@@ -100,10 +99,10 @@ def setting(default, meaning, least=0, choices=()):
 
 
 SCENES = ("toy", *data_prep.SCENES)
+DEVICES = ("auto", "cpu", "cuda")
 SWITCH = ("auto", "on", "off")
 GROUPS = dict(  # titles in --help, by the first setting of each group
-    scene="what", steps="how long", rays="model", lam_eik="weights of losses",
-    lr_grid="learning rates")
+    scene="what", steps="how long", rays="model", lam_eik="loss weights", lr_grid="learning rates")
 
 
 @dataclass
@@ -113,8 +112,7 @@ class Config:
     data: str = setting("", "an IMC-PT or COLMAP folder instead of --scene")
     name: str = setting("", "folder below runs/ (default: scene-method-seed)")
     seed: int = setting(0, "seed of training; a toy has its own")
-    device: str = setting(
-        "auto", "cpu, cuda, or auto (a GPU if there is one)", choices=("auto", "cpu", "cuda"))
+    device: str = setting("auto", "cpu, cuda, or auto (a GPU if there is one)", choices=DEVICES)
     downscale: int = setting(2, "factor by which photos are made smaller", least=1)
     steps: int = setting(3000, "training steps", least=1)
     minutes: float = setting(0.0, "minutes of training; above 0, steps do not count")
@@ -125,11 +123,9 @@ class Config:
     levels: int = setting(0, "octree levels, 0: as fine as a pixel", choices=range(9))
     hidden: int = setting(64, "width of the networks", least=1)
     appearance_dim: int = setting(16, "length of a photo's appearance code")
-    appearance: str = setting(
-        "auto", "codes: on, off, or auto (if exposures differ)", choices=SWITCH)
-    mask: str = setting("auto", "mask: on, off, or auto (if it marks much)", choices=SWITCH)
-    background: str = setting(
-        "auto", "a field: on, off, or auto (unless one colour)", choices=SWITCH)
+    appearance: str = setting("auto", "codes: on, off, auto (if exposures differ)", choices=SWITCH)
+    mask: str = setting("auto", "mask: on, off, auto (if it marks much)", choices=SWITCH)
+    background: str = setting("auto", "a field: on, off, auto (unless one colour)", choices=SWITCH)
     lam_eik: float = setting(0.004, "L_eik, eikonal (Permuto-SDF: 0.04)")
     lam_curv: float = setting(0.01, "L_curv, curvature: |lap s| eps [D2]")
     lam_mask: float = setting(1.0, "L_reg, which trains the mask [D3]")
@@ -146,8 +142,7 @@ class Config:
         """Refuses what cannot work, before anything is written."""
         for option in fields(self):
             value = getattr(self, option.name)
-            least = option.metadata["least"]
-            choices = option.metadata["choices"]
+            _, least, choices = option.metadata.values()
             if choices:
                 words = ", ".join(map(str, choices))
                 check(value in choices, f"--{option.name} {value} is unknown: use one of {words}")
@@ -1399,23 +1394,19 @@ def fingerprint(raw):
     return dict(zip([*raw["name"].tolist(), "the sphere"], checksums))
 
 
-def write_lines(path, lines):
-    atomic_write(path, lambda part: part.write_text("".join(lines)))
-
-
-def save(run, model, optimizer, gen, state):
-    """Replaces checkpoint.pt, which has the log in it, then log.jsonl. The old log shows whether
-    another process writes to the folder, too."""
+def save(run, model, optimizer, gen, state, terms, done):
+    """Adds a line to the log, replaces checkpoint.pt, which has the log in it, and log.jsonl, then
+    prints. Of two processes in a folder, one is the first to make or to change log.jsonl, and the
+    other one ends."""
+    line = dict(step=state.step, seconds=state.seconds, joules=state.joules)
+    line |= {key: value.item() for key, value in terms.items()}
+    line["psnr"] = -10 * math.log10(line["mse"] + 1e-10)  # of the step's rays, people included
     log = run / "log.jsonl"
-    former = "".join(state.log[:-1])
     run.mkdir(parents=True, exist_ok=True)
-    try:
-        if not former:
-            log.touch(exist_ok=False)  # of two that begin at once, one makes the file
-        is_own = log.read_text() == former
-    except FileExistsError:
-        is_own = False
-    check(is_own, f"another process trains in {run}: train beside it by --name NAME")
+    log.touch(exist_ok=len(state.log) > 0)
+    check(log.read_text() == "".join(state.log), f"another process trains in {run}, too: stop it "
+          "and go on with --resume, or train beside it by --name NAME")
+    state.log.append(json.dumps(line) + "\n")
     saved = dict(
         config=vars(model.cfg),
         scene=fingerprint(model.scene.raw),
@@ -1427,7 +1418,8 @@ def save(run, model, optimizer, gen, state):
     buffer = io.BytesIO()  # as torch.save calls a full disk a RuntimeError
     torch.save(saved, buffer)
     atomic_write(run / "checkpoint.pt", lambda part: part.write_bytes(buffer.getbuffer()))
-    write_lines(log, state.log)
+    atomic_write(log, lambda part: part.write_text("".join(state.log)))
+    print(f"  {min(done, 1):4.0%}  step {state.step}  psnr {line['psnr']:.2f}", flush=True)
 
 
 @contextlib.contextmanager
@@ -1462,8 +1454,7 @@ def read_checkpoint(path, given):
 def restore(saved, model, gen=None):
     """Puts a checkpoint's weights into a model, and its random numbers into gen, which must be of
     the same kind of device; returns its optimiser and State."""
-    before = saved["scene"]
-    now = fingerprint(model.scene.raw)
+    before, now = saved["scene"], fingerprint(model.scene.raw)
     changed = [name for name in before | now if before.get(name) != now.get(name)]
     changed.sort(key=lambda name: name in before and name in now)  # missing and new ones first
     check(not changed, f"checkpoint.pt was trained with other photos, splits, sizes or cameras: "
@@ -1498,23 +1489,6 @@ def load_run(run, **given):
     return model, scene, codes
 
 
-@contextlib.contextmanager
-def on_signals(handler):
-    """Ctrl-C, SIGTERM and SIGHUP (a closed terminal) call a handler meanwhile, in the main thread.
-    A signal that is ignored, as nohup does, stays ignored."""
-    old = {}
-    for name in ("SIGINT", "SIGTERM", "SIGHUP"):
-        number = getattr(signal, name, None)  # Windows has no SIGHUP
-        is_main = threading.current_thread() is threading.main_thread()
-        if number and is_main and signal.getsignal(number) != signal.SIG_IGN:
-            old[number] = signal.signal(number, handler)
-    try:
-        yield
-    finally:
-        for number, former in old.items():
-            signal.signal(number, former)
-
-
 def lap_times():
     """Yields 0, then the seconds since the last call. A gap that no step explains, as of Ctrl-Z, a
     laptop's lid or a paused container, is no training: it counts as a usual step."""
@@ -1530,6 +1504,12 @@ def lap_times():
             lap = usual
         recent.append(lap)
         yield lap
+
+
+def check_finite(model):
+    check(all(p.isfinite().all() for p in model.parameters()),
+          "weights are no longer finite: correct the poses, or try a third of the learning rates "
+          "--lr_grid and --lr_net; an older checkpoint.pt, if any, is still there")
 
 
 def train(cfg, scene, run, saved=None, processes=ALONE):
@@ -1558,7 +1538,7 @@ def train(cfg, scene, run, saved=None, processes=ALONE):
         for name in RESULTS:  # of the shorter training
             (run / name).unlink(missing_ok=True)
         shutil.rmtree(run / "held_out", ignore_errors=True)
-        write_lines(run / "log.jsonl", state.log)
+        atomic_write(run / "log.jsonl", lambda part: part.write_text("".join(state.log)))
     meter = metered_joules(gen.device, state.joules, processes)
     next(meter, None)  # it counts from here
     laps = lap_times()
@@ -1582,18 +1562,10 @@ def train(cfg, scene, run, saved=None, processes=ALONE):
                 model.after_training()
             if done >= 1 or is_stopped or state.seconds >= next_log:  # in all processes at once
                 next_log = state.seconds + LOG_EVERY
-                check(all(p.isfinite().all() for p in model.parameters()),
-                      "weights are no longer finite: correct the poses, or try a third of the "
-                      "learning rates --lr_grid and --lr_net; an older checkpoint.pt is still there")
+                check_finite(model)
                 if processes.is_first:
                     state.joules = next(meter, None)  # None, never 0, once a counter has failed
-                    line = dict(step=state.step, seconds=state.seconds, joules=state.joules)
-                    line |= {key: value.item() for key, value in terms.items()}
-                    line["psnr"] = -10 * math.log10(line["mse"] + 1e-10)  # of the rays, with people
-                    state.log.append(json.dumps(line) + "\n")
-                    save(run, model, optimizer, gen, state)
-                    print(f"  {min(done, 1):4.0%}  step {state.step}  psnr {line['psnr']:.2f}",
-                          flush=True)
+                    save(run, model, optimizer, gen, state, terms, done)
             if before < MASK_TRAINING <= done:  # it prints, so the checkpoint comes first
                 model.decide_mask(processes)
     if caught or is_stopped:
@@ -1819,8 +1791,6 @@ def film(model, scene, path):
     with tempfile.TemporaryDirectory() as folder:  # as cv2 cannot open every path
         part = Path(folder, "film.mp4")
         video = cv2.VideoWriter(str(part), cv2.VideoWriter_fourcc(*"vp09"), 24, size)
-        check(video.isOpened(), "OpenCV cannot encode VP9: pip install --upgrade "
-              "opencv-contrib-python-headless")
         for n in progress(range(FRAMES), f"filming {FRAMES} frames"):
             phase = n / (FRAMES - 1)
             c2w = scene.c2w.clone()
@@ -1829,9 +1799,10 @@ def film(model, scene, path):
             rgb, _, _, _ = render_photo(model, view, photo, first.lerp(last, phase))
             video.write(to_uint8(rgb[..., ::-1]))
         video.release()
-        video = cv2.VideoCapture(str(part))  # as cv2 says nothing of a full disk
+        video = cv2.VideoCapture(str(part))  # read back, as a writer says nothing of a full disk
         count = sum(1 for _ in iter(lambda: video.read()[0], False))
-        check(count == FRAMES, f"{count} of {FRAMES} frames were written: make room in {folder}")
+        check(count == FRAMES, f"{count} of {FRAMES} frames were written: make room in {folder}, "
+              "or pip install --upgrade opencv-contrib-python-headless, which encodes VP9")
         data = part.read_bytes()
     atomic_write(path, lambda part: part.write_bytes(data))
     print(f"wrote {path}")
@@ -1847,9 +1818,9 @@ def make_lpips():
         print(f"  lpips is null ({error}): pip install lpips, and internet for its weights")
 
 
-def peak_memory(device):
+def peak_memory(is_cuda):
     """Most bytes in use at a time, of the GPU, else of this process; None on Windows."""
-    if device.type == "cuda":
+    if is_cuda:
         return torch.cuda.max_memory_allocated()
     with contextlib.suppress(ImportError):
         import resource
@@ -1867,29 +1838,28 @@ def code_version():
 def finish(model, scene, state, run):
     """Scores a trained model; writes codes, mesh, metrics and pictures below run. Returns the
     metrics, and prints those that are one number with a fraction."""
-    device = scene.c2w.device
     is_metered = state.joules is not None
+    is_cuda = scene.c2w.is_cuda
+    threads = f"cpu, {torch.get_num_threads()} threads"
     buffers = [tensor for octree in model.octrees for tensor in octree.buffers()]
     metrics = dict(
         scene=scene.info["scene"],
         method=model.name,
         seed=model.cfg.seed,
         steps=state.step,
-        device=f"cpu, {torch.get_num_threads()} threads",
+        device=torch.cuda.get_device_name() if is_cuda else threads,
         train_seconds=state.seconds,
         energy_wh=state.joules / 3600 if is_metered else None,
         energy_source=f"the device's counter, read every {LOG_EVERY} s" if is_metered else None,
         rays_per_second=state.step * model.cfg.rays / state.seconds,
         parameters=sum(p.numel() for p in model.parameters()),
         model_bytes=sum(tensor.nbytes for tensor in [*model.parameters(), *buffers]),
-        peak_memory_bytes=peak_memory(device),  # before scoring
+        peak_memory_bytes=peak_memory(is_cuda),  # before scoring
         protocol="appearance fitted on the left half, scored on the right half",
         has_mask=model.has_mask,
         torch=torch.__version__,
         commit=code_version(),
         config=vars(model.cfg))
-    if device.type == "cuda":
-        metrics["device"] = torch.cuda.get_device_name()
     scores, codes = evaluate(model, scene, make_lpips(), run / "held_out")
     metrics |= scores
     atomic_write(run / "codes.npy", lambda part: np.save(part, codes.cpu()))
@@ -1970,9 +1940,9 @@ def main(argv=None):
     check(cfg.rays % cfg.photos == 0,
           f"--rays {cfg.rays} must be a multiple of --photos {cfg.photos}")
     processes = ALONE
-    if int(os.environ.get("WORLD_SIZE", 1)) > 1:
-        numbers = [int(os.environ.get(key, 0)) for key in ("WORLD_SIZE", "RANK", "LOCAL_RANK")]
-        processes = Processes(*numbers)
+    if os.environ.get("WORLD_SIZE", "1") != "1":  # torchrun says so
+        numbers = [os.environ.get(key, 0) for key in ("WORLD_SIZE", "RANK", "LOCAL_RANK")]
+        processes = Processes(*map(int, numbers))
     device = pick_device(cfg.device, processes)
     if processes.count > 1:
         processes.join(device)
@@ -1990,15 +1960,6 @@ def main(argv=None):
             raise
     if processes.count > 1:
         dist.destroy_process_group()
-
-
-MEMORY_FULL = "allocat|out of memory|ALLOC_FAILED|_NOT_INITIALIZED|nsufficient memory"
-
-
-def is_memory_full(error):
-    """Whether an error says so: of Python, of OpenCV, of a CPU's allocator, CUDA, cuBLAS, cuDNN."""
-    can_be = isinstance(error, (MemoryError, RuntimeError, cv2.error))
-    return isinstance(error, MemoryError) or (can_be and re.search(MEMORY_FULL, str(error)))
 
 
 def run_command_line(entry):

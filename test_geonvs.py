@@ -2264,7 +2264,7 @@ def test_a_run_follows_its_seed(in_tmp_dir, whole):
 
 def test_of_two_that_begin_at_once_one_goes_on(loop):
     run_training()
-    with pytest.raises(UserError, match="another process"):
+    with pytest.raises(FileExistsError, match="log.jsonl"):
         run_training()
     assert loop.step.call_count == 7  # the second one ended at its first checkpoint
     assert read_saved()["state"]["step"] == 6
@@ -2434,7 +2434,8 @@ def test_a_bad_checkpoint_is_refused_in_one_sentence(in_tmp_dir):
 def saved(in_tmp_dir, warm):
     """The dictionary of a checkpoint from before the first step."""
     optimizer = geonvs.make_optimizer(warm)
-    geonvs.save(RUN, warm, optimizer, generator(), geonvs.State(log=["{}\n"]))
+    terms = dict(mse=torch.tensor(0.1))
+    geonvs.save(RUN, warm, optimizer, generator(), geonvs.State(), terms, done=0.0)
     return read_saved()
 
 
@@ -2839,18 +2840,19 @@ def test_a_film_sways_and_changes_its_light(warm, odd, in_tmp_dir, monkeypatch):
 
 
 def test_a_film_without_its_frames_replaces_none(warm, odd, in_tmp_dir, monkeypatch):
-    class FullDisk(cv2.VideoWriter):
-        """Takes half of the frames, and says nothing."""
-        count = 0
-
-        def write(self, frame):
-            self.count += 1
-            if self.count <= 48:
-                super().write(frame)
     w, h = odd.wh[0].tolist()
-    monkeypatch.setattr(
-        geonvs, "render_photo", lambda *_: (np.zeros((h, w, 3)), None, None, None))
-    monkeypatch.setattr(cv2, "VideoWriter", FullDisk)
+    frame = np.zeros((h, w, 3))
+    make_writer = cv2.VideoWriter
+
+    def full_disk(*args):
+        """A writer that loses half of the frames, and says nothing."""
+        writer = make_writer(*args)
+        frames = itertools.count()
+        return SimpleNamespace(
+            write=lambda picture: next(frames) < 48 and writer.write(picture),
+            release=writer.release)
+    monkeypatch.setattr(geonvs, "render_photo", lambda *_: (frame, None, None, None))
+    monkeypatch.setattr(cv2, "VideoWriter", full_disk)
     Path("a.mp4").write_text("a film")
     with pytest.raises(UserError, match="48 of 96 frames"):
         geonvs.film(warm, odd, Path("a.mp4"))
