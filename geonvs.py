@@ -1835,7 +1835,7 @@ def code_version():
         return subprocess.run(command, capture_output=True, text=True).stdout.strip() or None
 
 
-def finish(model, scene, state, run):
+def finish(model, scene, state, run, processes=ALONE):
     """Scores a trained model; writes codes, mesh, metrics and pictures below run. Returns the
     metrics, and prints those that are one number with a fraction."""
     is_metered = state.joules is not None
@@ -1851,7 +1851,7 @@ def finish(model, scene, state, run):
         train_seconds=state.seconds,
         energy_wh=state.joules / 3600 if is_metered else None,
         energy_source=f"the device's counter, read every {LOG_EVERY} s" if is_metered else None,
-        rays_per_second=state.step * model.cfg.rays / state.seconds,
+        rays_per_second=processes.count * model.cfg.rays * state.step / state.seconds,
         parameters=sum(p.numel() for p in model.parameters()),
         model_bytes=sum(tensor.nbytes for tensor in [*model.parameters(), *buffers]),
         peak_memory_bytes=peak_memory(is_cuda),  # before scoring
@@ -1953,7 +1953,7 @@ def main(argv=None):
     model, state = train(cfg, scene, run, saved, processes)
     if processes.is_first:
         try:
-            finish(model, scene, state, run)
+            finish(model, scene, state, run, processes)
         except Exception as error:
             check(not is_memory_full(error), "the memory is full, but the training is saved: end "
                   "other programs, then go on with --resume")
@@ -1972,8 +1972,8 @@ def run_command_line(entry):
         except UserError as error:
             message = str(error)
         except OSError as error:  # a full disk, a folder without permission
-            message = (f"{error}: make room or choose another place; a run that has a checkpoint "
-                       "goes on with --resume")
+            message = (f"{error}: make room, or choose another place or --name; a run that has a "
+                       "checkpoint goes on with --resume")
         except KeyboardInterrupt as stop:
             message = str(stop) or "stopped; a run that has a checkpoint goes on with --resume"
         except Exception as error:
