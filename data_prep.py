@@ -809,12 +809,6 @@ def is_cut_off(data):
     return True
 
 
-def is_memory_full(error):
-    """Whether an error of Python, numpy or OpenCV says so."""
-    says = ("Insufficient memory", "Failed to allocate")
-    return isinstance(error, MemoryError) or any(text in str(error) for text in says)
-
-
 def decode(data, flags):
     """The decoded image, or None."""
     try:
