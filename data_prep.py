@@ -34,6 +34,7 @@ import struct
 import sys
 import tarfile
 import tempfile
+import threading
 import time
 import unicodedata
 import zipfile
@@ -112,6 +113,33 @@ def allow_any_character():
             stream.reconfigure(errors="backslashreplace")
 
 
+@contextlib.contextmanager
+def on_signals(handler):
+    """Ctrl-C, SIGTERM and SIGHUP (a closed terminal) call a handler meanwhile, in the main thread.
+    A signal that is ignored, as nohup does, stays ignored."""
+    old = {}
+    for name in ("SIGINT", "SIGTERM", "SIGHUP"):
+        number = getattr(signal, name, None)  # Windows has no SIGHUP
+        is_main = threading.current_thread() is threading.main_thread()
+        if number and is_main and signal.getsignal(number) != signal.SIG_IGN:
+            old[number] = signal.signal(number, handler)
+    try:
+        yield
+    finally:
+        for number, former in old.items():
+            signal.signal(number, former)
+
+
+MEMORY_FULL = "allocat|out of memory|ALLOC_FAILED|_NOT_INITIALIZED|nsufficient memory"
+
+
+def is_memory_full(error):
+    """Whether an error of Python, OpenCV, a CPU's allocator, CUDA, cuBLAS or cuDNN says so."""
+    if isinstance(error, (RuntimeError, cv2.error)):
+        return re.search(MEMORY_FULL, str(error)) is not None
+    return isinstance(error, MemoryError)
+
+
 def progress(items, what):
     """Yields items and prints progress: after 10 s every second, in a log file every minute."""
     is_terminal = sys.stdout.isatty()
@@ -149,6 +177,30 @@ def atomic_write(path, write):
 def write_scene(path, scene):
     """Writes the file uncompressed: a third larger, but six times faster."""
     atomic_write(path, lambda temporary: np.savez(temporary, **scene))
+
+
+def write_png(path, picture):
+    """An RGB picture (H,W,3) of bytes; encoded here, as cv2 cannot open every path."""
+    _, data = cv2.imencode(".png", picture[..., ::-1])
+    atomic_write(path, lambda temporary: temporary.write_bytes(data))
+
+
+def write_ply(path, vertices, faces, colors):
+    """A binary PLY file of vertices (P,3), faces (N,3) and the vertices' colours (P,3) in bytes.
+    Coordinates are doubles, as floats would round those of a map."""
+    vertex = np.empty(len(vertices), [("xyz", "<f8", 3), ("rgb", "u1", 3)])
+    vertex["xyz"] = vertices
+    vertex["rgb"] = colors
+    face = np.empty(len(faces), [("count", "u1"), ("corner", "<i4", 3)])
+    face["count"] = 3
+    face["corner"] = faces
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}"]
+    header += [f"property double {axis}" for axis in "xyz"]
+    header += [f"property uchar {channel}" for channel in ("red", "green", "blue")]
+    header += [f"element face {len(faces)}", "property list uchar int vertex_indices"]
+    header += ["end_header", ""]
+    data = "\n".join(header).encode() + vertex.tobytes() + face.tobytes()
+    atomic_write(path, lambda temporary: temporary.write_bytes(data))
 
 
 def refuse_bomb(path):
@@ -755,12 +807,6 @@ def is_cut_off(data):
             return False
         at += int.from_bytes(data[at:at + 2], "big")  # the segment's length
     return True
-
-
-def is_memory_full(error):
-    """Whether an error of Python, numpy or OpenCV says so."""
-    says = ("Insufficient memory", "Failed to allocate")
-    return isinstance(error, MemoryError) or any(text in str(error) for text in says)
 
 
 def decode(data, flags):
@@ -1490,6 +1536,55 @@ def surface_truth(scene, surface, background, landmark):
         wall_normal=normal[is_smooth],
         near_wall=near[is_near],
         near_wall_sdf=distance[is_near])
+
+
+def depth_edges(depth):
+    """Whether a pixel of depth (H,W), distances along rays, lies beside a jump: the second
+    difference of inverse depth, nearly 0 on a plane, exceeds 5 % of the largest of the three."""
+    inverse = 1 / depth.astype(np.float32)  # 0: sky
+    edges = np.zeros(depth.shape, bool)
+    for q, is_edge in (inverse, edges), (inverse.T, edges.T):  # down, then across
+        before, here, after = q[:-2], q[1:-1], q[2:]
+        bend = np.abs(2 * here - before - after)
+        is_edge[1:-1] |= bend > 0.05 * np.maximum(here, np.maximum(before, after))
+    return edges
+
+
+def mean_or_none(values):
+    return float(values.mean()) if len(values) else None
+
+
+def toy_truth(scene, sdf, gradient, mask=None):
+    """What only a toy can tell of a trained model. sdf (.,): its signed distance at near_wall;
+    gradient (.,3): the slope of that at wall; mask (P,): its M at all pixels of training photos.
+
+    sdf_error is the mean |s - s_true| near visible walls in scene units, normal_error the median
+    angle at walls in degrees. mask_iou compares M > 0.5 with the true people. False positives are
+    the mean M on static pixels: mask_static on all, mask_edges on those beside a jump of depth,
+    mask_flat on the others, mask_sky on the sky. None where nothing is to be measured."""
+    size = np.maximum(lengths(gradient) * lengths(scene["wall_normal"]), EPSILON)
+    cos = (gradient * scene["wall_normal"]).sum(1) / size
+    truth = dict(
+        sdf_error=float(np.abs(sdf - scene["near_wall_sdf"]).mean()),
+        normal_error=float(np.median(np.degrees(np.arccos(np.clip(cos, -1, 1))))))
+    regions = ("iou", "static", "edges", "flat", "sky")
+    truth |= {f"mask_{region}": None for region in regions}
+    if mask is None:
+        return truth
+    is_train = np.repeat(~scene["is_test"], np.diff(scene["start"]))  # by pixel
+    people = scene["occluder"][is_train]
+    depths = zip(np.split(scene["depth"], scene["start"][1:-1]), scene["wh"])
+    edges = [depth_edges(depth.reshape(h, w)).ravel() for depth, (w, h) in depths]
+    edges = np.concatenate(edges)[is_train]
+    is_sky = np.isinf(scene["depth"][is_train])
+    truth["mask_static"] = mean_or_none(mask[~people])
+    truth["mask_edges"] = mean_or_none(mask[~people & edges])
+    truth["mask_flat"] = mean_or_none(mask[~people & ~edges])
+    truth["mask_sky"] = mean_or_none(mask[~people & is_sky])
+    if people.any():
+        found = mask > 0.5
+        truth["mask_iou"] = float((found & people).sum() / (found | people).sum())
+    return truth
 
 
 # ---- download, SfM, command line -------------------------------------------------------

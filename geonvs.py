@@ -8,7 +8,7 @@ follow one ray from its pixel to the loss; the training loop comes after them.
     python geonvs.py                       toy scene: made, trained, scored (minutes, 2 CPU cores)
     python geonvs.py --scene brandenburg   a Phototourism scene (one GPU); also sacre, trevi, taj
     python geonvs.py --data DIR            your own COLMAP folder
-    torchrun --nproc_per_node 4 geonvs.py  on 4 GPUs that share the rays of each step
+    torchrun --nproc_per_node 4 geonvs.py  on 4 GPUs, each with rays of its own
     python geonvs.py --help                every setting with its meaning and default
 
 The paper's equations
@@ -55,36 +55,24 @@ Departures from the printed paper; the tag stands at the code
         that a scene does not need are off
 """
 import argparse
+import collections
 import contextlib
 import functools
-import inspect
 import io
-import itertools
 import json
 import math
 import os
-import re
 import shutil
 import signal
-import sqlite3
+import statistics
 import subprocess
 import sys
 import tempfile
 import time
-from dataclasses import dataclass, fields, replace
+import zlib
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import NamedTuple
-
-
-def stop_at_once(*_):
-    """Ends the program without a traceback while the libraries below are loaded, for seconds."""
-    os.write(2, b"error: stopped before anything was begun\n")
-    os._exit(2)
-
-
-if __name__ == "__main__":
-    signal.signal(signal.SIGINT, stop_at_once)
-    signal.signal(signal.SIGTERM, stop_at_once)
 
 import cv2
 import numpy as np
@@ -96,84 +84,84 @@ from skimage.metrics import structural_similarity
 from torch import Tensor, nn
 
 import data_prep
-from data_prep import UserError, atomic_write, check, progress
+from data_prep import (
+    UserError, atomic_write, check, is_memory_full, on_signals, progress, write_ply, write_png)
 
 # distances need float32: TF32 would drown finite differences in rounding errors
 torch.set_float32_matmul_precision("highest")
 
 
-# ---- 1 Config: every field is a flag -------------------------------------------------------------
+# ---- 1 Settings: every field of Config is a flag -------------------------------------------------
 
-AT_LEAST = dict(  # 0 for other settings
-    steps=1,
-    downscale=1,
-    rays=2,
-    photos=1,
-    samples=3,  # with fewer, zeta's upper bound would lie below its floor
-    bg_samples=6,
-    hidden=1)
+def setting(default, meaning, least=0, choices=()):
+    """A field of Config: its meaning for --help, its least value, or the values it may have."""
+    return field(default=default, metadata=dict(meaning=meaning, least=least, choices=choices))
+
+
+SCENES = ("toy", *data_prep.SCENES)
+DEVICES = ("auto", "cpu", "cuda")
 SWITCH = ("auto", "on", "off")
-CHOICES = dict(
-    scene=("toy", *data_prep.SCENES),
-    device=("auto", "cpu", "cuda"),
-    levels=range(9),
-    appearance=SWITCH,
-    mask=SWITCH,
-    background=SWITCH)
+GROUPS = dict(  # titles in --help, by the first setting of each group
+    scene="what", steps="how long", rays="model", lam_eik="loss weights", lr_grid="learning rates")
 
 
 @dataclass
 class Config:
-    """All settings; --help shows these comments. Of the defaults lam_gpl alone is the paper's."""
-    scene: str = "toy"  # toy: synthetic; others: Phototourism
-    data: str = ""  # an IMC-PT or COLMAP folder instead of a named scene
-    name: str = ""  # run folder below runs/ (default: scene-method-seed)
-    seed: int = 0  # seed of training; a toy has its own
-    device: str = "auto"  # auto: a GPU if there is one
-    steps: int = 3000  # training steps
-    minutes: float = 0.0  # training budget in minutes, instead of --steps if above 0
-    downscale: int = 2  # integer factor by which photos are made smaller (benchmarks use 2)
-    rays: int = 512  # rays per step, of all processes together
-    photos: int = 8  # photos per step, of each process; the mask network sees them whole
-    samples: int = 15  # intervals S of a ray in the foreground, S + 1 samples
-    bg_samples: int = 24  # background samples per ray, a sixth of them in front of the sphere
-    levels: int = 0  # octree levels, 0: from the pixel footprint at the surface
-    hidden: int = 64  # width of the MLPs
-    appearance_dim: int = 16  # length of a photo's appearance code
-    appearance: str = "auto"  # codes; auto: on if exposures differ
-    mask: str = "auto"  # transient mask; auto: off if it marks hardly anything
-    background: str = "auto"  # background field; auto: off if it is one colour
-    lam_eik: float = 0.004  # weight of L_eik, the eikonal loss (Permuto-SDF: 0.04)
-    lam_curv: float = 0.01  # weight of L_curv, the curvature loss, on |lap s| eps [D2]
-    lam_mask: float = 1.0  # weight of L_reg, which trains the mask [D3]
-    lam_gpl: float = 0.05  # weight of L_GPL, the geometry-preservation loss (paper)
-    lam_lps: float = 1e-5  # weight of L_lps, the Lipschitz loss, log form [D4]
-    lam_sfm: float = 7.5e-3  # weight of min(zeta, 40) |s(p)| at SfM points [D7]
-    lam_off: float = 0.03  # weight of L_off, the off-surface penalty: cameras see through air [D7]
-    lr_grid: float = 1e-2  # learning rate of octree features
-    lr_code: float = 3e-2  # learning rate of appearance codes
-    lr_net: float = 4e-3  # learning rate of networks
-    lr_mask: float = 8e-3  # learning rate of the mask network
+    """All settings. Of the defaults, lam_gpl alone is the paper's."""
+    scene: str = setting("toy", "toy, brandenburg, sacre, trevi or taj", choices=SCENES)
+    data: str = setting("", "an IMC-PT or COLMAP folder instead of --scene")
+    name: str = setting("", "folder below runs/ (default: scene-method-seed)")
+    seed: int = setting(0, "seed of training; a toy has its own")
+    device: str = setting("auto", "cpu, cuda, or auto (a GPU if there is one)", choices=DEVICES)
+    downscale: int = setting(2, "factor by which photos are made smaller", least=1)
+    steps: int = setting(3000, "training steps", least=1)
+    minutes: float = setting(0.0, "minutes of training; above 0, steps do not count")
+    rays: int = setting(512, "rays per step, of each process", least=2)
+    photos: int = setting(8, "photos per step, of each process", least=1)
+    samples: int = setting(15, "intervals of a ray in the foreground", least=3)
+    bg_samples: int = setting(24, "background samples, a sixth in front", least=6)
+    levels: int = setting(0, "octree levels, 0: as fine as a pixel", choices=range(9))
+    hidden: int = setting(64, "width of the networks", least=1)
+    appearance_dim: int = setting(16, "length of a photo's appearance code")
+    appearance: str = setting("auto", "codes: on, off, auto (if exposures differ)", choices=SWITCH)
+    mask: str = setting("auto", "mask: on, off, auto (if it marks much)", choices=SWITCH)
+    background: str = setting("auto", "a field: on, off, auto (unless one colour)", choices=SWITCH)
+    lam_eik: float = setting(0.004, "L_eik, eikonal (Permuto-SDF: 0.04)")
+    lam_curv: float = setting(0.01, "L_curv, curvature: |lap s| eps [D2]")
+    lam_mask: float = setting(1.0, "L_reg, which trains the mask [D3]")
+    lam_gpl: float = setting(0.05, "L_GPL, geometry preservation")
+    lam_lps: float = setting(1e-5, "L_lps, Lipschitz bound, log form [D4]")
+    lam_sfm: float = setting(7.5e-3, "min(zeta, 40) |s(p)| at SfM points [D7]")
+    lam_off: float = setting(0.03, "L_off, off-surface: air that cameras see [D7]")
+    lr_grid: float = setting(1e-2, "octree features")
+    lr_code: float = setting(3e-2, "appearance codes")
+    lr_net: float = setting(4e-3, "networks")
+    lr_mask: float = setting(8e-3, "mask network")
 
     def __post_init__(self):
-        """Refuses numbers that cannot work, before anything is written."""
-        for name, value in vars(self).items():
-            least = AT_LEAST.get(name, 0)
-            check(isinstance(value, str) or least <= value < 2**31,
-                  f"--{name} {value} is out of range: use {least} to 2^31 - 1")
+        """Refuses what cannot work, before anything is written."""
+        for option in fields(self):
+            value = getattr(self, option.name)
+            _, least, choices = option.metadata.values()
+            if choices:
+                words = ", ".join(map(str, choices))
+                check(value in choices, f"--{option.name} {value} is unknown: use one of {words}")
+            elif option.type is not str:
+                check(least <= value < 2**31,
+                      f"--{option.name} {value} is out of range: use {least} to 2^31 - 1")
+        if self.data:
+            self.data = os.path.realpath(self.data)  # to be found from any folder
 
     @property
     def source(self):
-        """What data_prep.open_scene takes: a scene's name, or an absolute path."""
-        if self.data:
-            return os.path.realpath(self.data)
-        return self.scene
+        """What data_prep.open_scene takes: a folder, or a scene's name."""
+        return self.data or self.scene
 
 
 # settings of photos on a GPU that differ from Config's defaults; flags override them
 GPU_DEFAULTS = dict(
     steps=75_000,
-    rays=16_384,  # on an H100 a step takes as long with fewer: it waits for the CPU's launches
+    rays=16_384,  # on an H100 a step takes as long with fewer: it is bound by kernel launches
     photos=16,
     samples=32,
     appearance_dim=32)
@@ -223,8 +211,11 @@ def load_scene(raw, device="cpu"):
     return Scene(*tensors, raw, json.loads(str(raw["info"])))
 
 
-def read_scene(cfg):
-    """The dictionary of the scene file that settings name; the file is made on first use."""
+def read_scene(cfg, home=None):
+    """The dictionary of the scene file that settings name; the file is made on first use. home: the
+    folder in which a run was trained, if another one than here."""
+    if home and (home / data_prep.scene_path(cfg.source)).exists() and not home.samefile("."):
+        return data_prep.read_scene(home / data_prep.scene_path(cfg.source))
     is_there = not cfg.data or Path(cfg.data).is_dir()
     check(is_there or data_prep.scene_path(cfg.source).exists(),
           f"{cfg.data} does not exist: give the folder's place by --data; a run that was trained "
@@ -1076,7 +1067,8 @@ class GeoNVS(nn.Module):
 
     def __init__(self, cfg, scene):
         super().__init__()
-        self.cfg = replace(cfg)  # a copy, as training decides --mask auto
+        self.cfg = replace(cfg)
+        self.has_mask = cfg.mask != "off"  # until decide_mask
         self.scene = scene
         self.jitter_per_ray = cfg.samples - 1 + cfg.bg_samples  # they place a ray's samples
         levels, A, has_background = needed_parts(cfg, scene.raw)
@@ -1177,7 +1169,7 @@ class GeoNVS(nn.Module):
         reg = error.new_zeros(())
         gpl = error.new_zeros(())
         left_out = torch.zeros_like(error)
-        if self.cfg.mask != "off":
+        if self.has_mask:
             with torch.set_grad_enabled(done < MASK_TRAINING):
                 logit = sample_logits(self.mask.logits(photos), rays.uv)  # (R,)
             M = logit.sigmoid()
@@ -1239,13 +1231,12 @@ class GeoNVS(nn.Module):
             dict(name="codes", params=codes, base_lr=cfg.lr_code),
             dict(name="mask", params=mask, base_lr=cfg.lr_mask)]
 
-    def refine(self, optimizer):
+    def refine(self, optimizer, processes):
         """Splits cells where colours err; Adam's moments move along with their features. [D10]"""
         octree = self.sdf.octree
-        if RANKS > 1:
-            dist.all_reduce(octree.cell_error)
+        processes.sum(octree.cell_error)
         # sums of floats differ between GPUs: one process chooses the cells for all
-        worst = from_first_process(cells_to_split(octree).cpu())
+        worst = processes.share(cells_to_split(octree).cpu())
         state = optimizer.state.pop(octree.features)
         is_old = octree.split(worst.to(octree.features.device))
         for name in ("exp_avg", "exp_avg_sq"):
@@ -1256,14 +1247,14 @@ class GeoNVS(nn.Module):
                 group["params"] = [tree.features for tree in self.octrees]
 
     @torch.no_grad()
-    def decide_mask(self):
+    def decide_mask(self, processes):
         """--mask auto: off if M marks hardly anything in the first 64 training photos; pixels that
         a user's mask excludes count, too. [D10]"""
         if self.cfg.mask == "auto":
             photos = self.scene.train[:64]
             share = self.mask.logits(photos).sigmoid().mean().item()
-            self.cfg.mask = from_first_process("on" if share > 0.01 else "off")
-            print(f"  mean mask {share:.4f}: mask {self.cfg.mask}")
+            self.has_mask = processes.share(share > 0.01)
+            print(f"  mean mask {share:.4f}: mask {'on' if self.has_mask else 'off'}")
 
     def codes(self):
         """Appearance codes (I,A) of all photos."""
@@ -1275,29 +1266,71 @@ class GeoNVS(nn.Module):
         return render_rays(self, rays, code, middle, rays.o[:0])
 
 
-# ---- 8 Energy ------------------------------------------------------------------------------------
+# ---- 8 Processes and energy ----------------------------------------------------------------------
 
-def open_counter(device):
-    """A function that reads joules of a GPU, or of the GPUs of all processes, through NVML (Volta
-    and newer), whatever CUDA_VISIBLE_DEVICES says. All processes run on one machine."""
-    check(device.type == "cuda", "only GPUs are metered")
-    import pynvml
-    pynvml.nvmlInit()
-    gpus = []
-    for number in range(RANKS):  # the first process has the first GPU
-        uuid = torch.cuda.get_device_properties(number).uuid
-        gpus.append(pynvml.nvmlDeviceGetHandleByUUID(f"GPU-{uuid}"))
-    return lambda: sum(map(pynvml.nvmlDeviceGetTotalEnergyConsumption, gpus)) / 1e3  # from mJ
+@dataclass
+class Processes:
+    """The processes that torchrun started, or this one alone. Each draws its own rays and follows
+    its own quantiles. Gradients are averaged, and the first process decides, speaks and writes; so
+    all hold the same weights."""
+    count: int = 1
+    rank: int = 0
+    local_rank: int = 0  # on this machine: the number of the process's GPU
+
+    @property
+    def is_first(self):
+        return self.rank == 0
+
+    def join(self, device):
+        """Connects this process with the others; those are silent."""
+        check("MASTER_ADDR" in os.environ, "start processes by torchrun, or unset WORLD_SIZE")
+        has_nccl = device.type == "cuda" and dist.is_nccl_available()  # not on Windows
+        if device.type == "cuda":
+            torch.cuda.set_device(device)
+        dist.init_process_group("cpu:gloo,cuda:nccl" if has_nccl else "gloo")
+        if not self.is_first:
+            sys.stdout = open(os.devnull, "w", errors="replace")
+
+    def share(self, value):
+        """The first process's value, for all of them."""
+        box = [value]
+        if self.count > 1:
+            dist.broadcast_object_list(box)
+        return box[0]
+
+    def sum(self, tensor):
+        """Adds up a tensor over processes, in place."""
+        if self.count > 1:
+            dist.all_reduce(tensor)
+
+    def average_gradients(self, model):
+        """Averages gradients over processes, in one transfer."""
+        if self.count > 1:
+            grads = [p.grad for p in model.parameters() if p.grad is not None]
+            flat = nn.utils.parameters_to_vector(grads)
+            self.sum(flat)
+            nn.utils.vector_to_parameters(flat / self.count, grads)
 
 
-def metered_joules(device, joules):
-    """Yields the joules spent until then, on top of those given; ends once a counter has failed
-    (joules None: it had before), which ends metering, not the run."""
+ALONE = Processes()
+
+
+def metered_joules(device, joules, processes=ALONE):
+    """Yields the joules that the GPUs of all processes have spent since the first call, on top of
+    those given, from their NVML counters (Volta and newer). Ends once a counter fails, or if it had
+    failed before (joules None): that ends metering, not the run."""
     try:
-        counter = open_counter(device)
-        begin = counter()
+        check(device.type == "cuda", "only GPUs are metered")
+        import pynvml
+        pynvml.nvmlInit()
+        gpus = []
+        for number in range(processes.count):  # the first process has the first GPU
+            uuid = torch.cuda.get_device_properties(number).uuid
+            gpus.append(pynvml.nvmlDeviceGetHandleByUUID(f"GPU-{uuid}"))
+        begin = sum(map(pynvml.nvmlDeviceGetTotalEnergyConsumption, gpus))  # mJ
         while joules is not None:
-            yield joules + counter() - begin
+            now = sum(map(pynvml.nvmlDeviceGetTotalEnergyConsumption, gpus))
+            yield joules + (now - begin) / 1e3
     except Exception as error:  # a package, a driver's answer or a permission is missing
         print(f"  energy is null ({error}); on a GPU: pip install nvidia-ml-py")
 
@@ -1305,14 +1338,8 @@ def metered_joules(device, joules):
 # ---- 9 Training ----------------------------------------------------------------------------------
 
 REFINE_AT = (0.1, 0.2, 0.3, 0.45, 0.6)  # shares of training at which the octree is refined
-PAUSE = 30  # seconds between lines of the log; a checkpoint is made with each
-PROGRESS = ("checkpoint.pt", "log.jsonl")  # what training writes
+LOG_EVERY = 30  # seconds between lines of the log; a checkpoint is made with each
 RESULTS = ("metrics.json", "codes.npy", "panel.png", "mesh.ply", "film.mp4")  # and held_out/
-# torchrun starts RANKS processes. Each draws its own rays and follows its own quantiles; gradients
-# are averaged; the first process decides, speaks and writes; so all hold the same weights.
-RANKS = int(os.environ.get("WORLD_SIZE", 1))
-RANK = int(os.environ.get("RANK", 0)) if RANKS > 1 else 0
-LOCAL_RANK = int(os.environ.get("LOCAL_RANK", RANK)) if RANKS > 1 else 0  # on this machine
 
 
 @dataclass
@@ -1321,34 +1348,30 @@ class State:
     step: int = 0
     seconds: float = 0.0
     joules: float | None = 0.0  # None once a counter has failed
+    log: list = field(default_factory=list)  # lines of log.jsonl, as text
+
+    def share_done(self, cfg):
+        """Share of training that is done, of steps or minutes; 1 or more: it is over."""
+        if cfg.minutes > 0:
+            return self.seconds / (60 * cfg.minutes)
+        return self.step / cfg.steps
 
 
-def from_first_process(value):
-    """The value that the first process has, for all of them."""
-    box = [value]
-    if RANKS > 1:
-        dist.broadcast_object_list(box)
-    return box[0]
+def make_optimizer(model):
+    """Adam as is usual for feature grids (Instant-NGP)."""
+    return torch.optim.Adam(model.groups(), betas=(0.9, 0.99), eps=1e-15, fused=True)
 
 
-def average_gradients(model):
-    for p in model.parameters():
-        if p.grad is not None:
-            dist.all_reduce(p.grad)
-            p.grad /= RANKS
-
-
-def training_step(model, optimizer, step, done, gen):
+def training_step(model, optimizer, step, done, gen, processes=ALONE):
     """One update; the learning rate rises for 20 steps, then follows a cosine down to 5 %. done:
     share of training, 0..1. Returns the log of GeoNVS.losses and the total. Never waits for the
     device."""
     model.before_step(step, done)
-    rays, picked = model.batch(model.cfg.rays // RANKS, gen)
+    rays, picked = model.batch(model.cfg.rays, gen)
     loss, terms, out = model.losses(rays, picked, done, gen)
     optimizer.zero_grad()
     loss.backward()
-    if RANKS > 1:
-        average_gradients(model)
+    processes.average_gradients(model)
     warm_up = min(1, (step + 1) / 20)
     decay = 0.525 + 0.475 * math.cos(math.pi * done)
     for group in optimizer.param_groups:
@@ -1358,49 +1381,34 @@ def training_step(model, optimizer, step, done, gen):
     return terms | dict(total=loss.detach())
 
 
-def share_done(cfg, state):
-    """Share of training that is done, of steps or minutes; 1 or more: it is over."""
-    if cfg.minutes > 0:
-        return state.seconds / (60 * cfg.minutes)
-    return state.step / cfg.steps
+def fingerprint(raw):
+    """What weights depend on: a checksum of each photo's place in the list, split, size and camera,
+    and one of the sphere. Rounded, as other machines prepare a scene with other last digits."""
+    count = len(raw["name"])
+    columns = [np.arange(count), raw["is_test"], raw["wh"], raw["K"], raw["c2w"]]
+    photos = np.hstack([np.reshape(column, (count, -1)) for column in columns])
+    sphere = np.append(raw["center"] / raw["scale"], np.log(raw["scale"]))
+    rows = [*photos, sphere]
+    checksums = [zlib.crc32((row.round(5) + 0).tobytes()) for row in rows]  # + 0: there is no -0
+    return dict(zip([*raw["name"].tolist(), "the sphere"], checksums))
 
 
-def make_optimizer(model):
-    """Adam as is usual for feature grids (Instant-NGP)."""
-    return torch.optim.Adam(model.groups(), betas=(0.9, 0.99), eps=1e-15, fused=True)
-
-
-def scene_facts(scene):
-    """What the weights of a model depend on, in plain values."""
-    raw = scene.raw
-    facts = {key: raw[key].tolist() for key in ("name", "is_test", "wh", "K", "c2w")}
-    facts["sphere"] = [[*raw["center"].tolist(), float(raw["scale"])]]
-    return facts
-
-
-def check_same_scene(saved, now):
-    """UserError with the first difference between the scene_facts of a checkpoint and of now."""
-    advice = "use its photos, model and flags, or train under another --name"
-    photos = itertools.zip_longest(saved["name"], now["name"], fillvalue="nothing")
-    for before, name in photos:
-        check(before == name, f"checkpoint.pt was trained with photo {before}, and here is {name} "
-              f"in its place: {advice}")
-    for key in ("is_test", "wh", "K", "c2w", "sphere"):
-        rows = len(now[key])
-        new = np.array(now[key], float).reshape(rows, -1)
-        old = np.array(saved[key], float).reshape(rows, -1)
-        # a scene file that another machine made may differ in the last digits
-        for row, column in np.argwhere(~np.isclose(old, new, rtol=1e-6, atol=1e-6)):
-            whose = "the scene" if key == "sphere" else now["name"][row]
-            raise UserError(
-                f"checkpoint.pt was trained with other data: {key} of {whose}, number {column}, "
-                f"was {old[row, column]:.9g} and is {new[row, column]:.9g}: {advice}")
-
-
-def save_checkpoint(path, model, optimizer, gen, state):
+def save(run, model, optimizer, gen, state, terms, done):
+    """Adds a line to the log, replaces checkpoint.pt, which has the log in it, and log.jsonl, then
+    prints. Of two processes in a folder, one is the first to make or to change log.jsonl, and the
+    other one ends."""
+    line = dict(step=state.step, seconds=state.seconds, joules=state.joules)
+    line |= {key: value.item() for key, value in terms.items()}
+    line["psnr"] = -10 * math.log10(line["mse"] + 1e-10)  # of the step's rays, people included
+    log = run / "log.jsonl"
+    run.mkdir(parents=True, exist_ok=True)
+    log.touch(exist_ok=len(state.log) > 0)
+    check(log.read_text() == "".join(state.log), f"another process trains in {run}, too: stop it "
+          "and go on with --resume, or train beside it by --name NAME")
+    state.log.append(json.dumps(line) + "\n")
     saved = dict(
         config=vars(model.cfg),
-        scene=scene_facts(model.scene),
+        scene=fingerprint(model.scene.raw),
         octrees=[octree.split_keys.clone() for octree in model.octrees],
         model=model.state_dict(),
         optimizer=optimizer.state_dict(),
@@ -1408,60 +1416,71 @@ def save_checkpoint(path, model, optimizer, gen, state):
         state=vars(state))
     buffer = io.BytesIO()  # as torch.save calls a full disk a RuntimeError
     torch.save(saved, buffer)
-    atomic_write(path, lambda part: part.write_bytes(buffer.getbuffer()))
+    atomic_write(run / "checkpoint.pt", lambda part: part.write_bytes(buffer.getbuffer()))
+    atomic_write(log, lambda part: part.write_text("".join(state.log)))
+    print(f"  {min(done, 1):4.0%}  step {state.step}  psnr {line['psnr']:.2f}", flush=True)
 
 
+@contextlib.contextmanager
+def refuses_damage():
+    """One sentence for whatever fails with a damaged checkpoint: zip, pickle, tensor storage."""
+    try:
+        yield
+    except UserError:
+        raise
+    except Exception as error:
+        raise UserError(
+            f"checkpoint.pt is damaged, or does not fit scene and settings ({error!r:.90}): use "
+            "the flags and kind of device that it was made with, or train under another --name")
+
+
+@refuses_damage()
 def read_checkpoint(path, given):
-    """A checkpoint's dictionary, tensors and plain values, never code; and its settings, replaced
-    by those given. Raises UserError."""
+    """A checkpoint's dictionary, of tensors and plain values, never code; and its settings,
+    replaced by those given."""
     check(path.exists(), f"{path} does not exist: train first, without --resume or --render, or "
           "name the run by the --scene, --data, --seed or --name it was made with")
-    try:
-        data_prep.refuse_bomb(path)
-        saved = dict(torch.load(path, map_location="cpu", weights_only=True))
-        settings = saved["config"] | given
-    except Exception as error:  # a damaged file can fail in any layer: zip, pickle, tensor storage
-        raise UserError(f"{path} is damaged, too large for the memory or of another program "
-                        f"({type(error).__name__}): train again under another --name")
-    unknown = settings.keys() - {setting.name for setting in fields(Config)}
+    data_prep.refuse_bomb(path)
+    saved = dict(torch.load(path, map_location="cpu", weights_only=True))
+    settings = saved["config"] | given
+    unknown = settings.keys() - vars(Config()).keys()
     check(not unknown, f"{path} has settings that this version of geonvs.py does not know "
           f"({', '.join(map(str, unknown))}): use the version that made it, or another --name")
     return saved, Config(**settings)
 
 
+@refuses_damage()
 def restore(saved, model, gen=None):
     """Puts a checkpoint's weights into a model, and its random numbers into gen, which must be of
     the same kind of device; returns its optimiser and State."""
-    try:
-        check_same_scene(dict(saved["scene"]), scene_facts(model.scene))
-        for octree, keys in zip(model.octrees, saved["octrees"], strict=True):
-            octree.build(keys.to(octree.child.device))
-        model.load_state_dict(saved["model"])
-        if RANK > 0:  # the file has the first one's, which must not be counted again
-            model.sdf.octree.cell_error.zero_()
-        optimizer = make_optimizer(model)
-        groups = optimizer.state_dict()["param_groups"]  # learning rates may be given anew
-        optimizer.load_state_dict(dict(saved["optimizer"], param_groups=groups))
-        if gen and RANK == 0:  # the others draw from their first ray again
-            gen.set_state(saved["generator"])
-        return optimizer, State(**saved["state"])
-    except UserError:
-        raise
-    except Exception as error:  # as in read_checkpoint
-        raise UserError(f"checkpoint.pt does not fit scene and settings ({error!r:.90}): use flags "
-                        "and kind of device as it was made with, or another --name")
+    before, now = saved["scene"], fingerprint(model.scene.raw)
+    changed = [name for name in before | now if before.get(name) != now.get(name)]
+    changed.sort(key=lambda name: name in before and name in now)  # missing and new ones first
+    check(not changed, f"checkpoint.pt was trained with other photos, splits, sizes or cameras: "
+          f"{len(changed)} differ, first {changed[:1]}: use its data, or another --name")
+    for octree, keys in zip(model.octrees, saved["octrees"], strict=True):
+        octree.build(keys.to(octree.child.device))
+    model.load_state_dict(saved["model"])
+    optimizer = make_optimizer(model)
+    groups = optimizer.state_dict()["param_groups"]  # learning rates may be given anew
+    optimizer.load_state_dict(dict(saved["optimizer"], param_groups=groups))
+    if gen:
+        gen.set_state(saved["generator"])
+    return optimizer, State(**saved["state"])
 
 
 def load_run(run, **given):
     """Model, scene and appearance codes (I,A) of all photos of a run that was trained, such as
     runs/toy-geonvsw-0. Settings may be given anew: device="cpu"."""
-    run = Path(run)
+    run = Path(run).resolve()
     saved, cfg = read_checkpoint(run / "checkpoint.pt", given)
     device = pick_device(cfg.device)
-    scene = load_scene(read_scene(cfg), device)
+    scene = load_scene(read_scene(cfg, run.parent.parent), device)
     with device:
         model = GeoNVS(cfg, scene)
-    restore(saved, model)
+    _, state = restore(saved, model)
+    if state.share_done(cfg) >= MASK_TRAINING:
+        model.decide_mask(ALONE)
     model.after_training()  # a run that was stopped has an older cache
     codes = model.codes()
     if (run / "codes.npy").exists():  # finished: codes of test photos are fitted
@@ -1469,113 +1488,95 @@ def load_run(run, **given):
     return model, scene, codes
 
 
-@contextlib.contextmanager
-def postponed_signals():
-    """Collects Ctrl-C and SIGTERM in the list it yields, so that a step is finished first."""
-    caught = []
-    handlers = {}
-    for number in (signal.SIGINT, signal.SIGTERM):
-        handlers[number] = signal.signal(number, lambda number, _: caught.append(number))
-    try:
-        yield caught
-    finally:
-        for number, handler in handlers.items():
-            signal.signal(number, handler)
+def lap_times():
+    """Yields 0, then the seconds since the last call. A gap that no step explains, as of Ctrl-Z, a
+    laptop's lid or a paused container, is no training: it counts as a usual step."""
+    recent = collections.deque(maxlen=50)
+    last = time.perf_counter()
+    yield 0.0
+    while True:
+        now = time.perf_counter()
+        lap = now - last
+        last = now
+        usual = statistics.median(recent or [lap])
+        if lap > max(10, 20 * usual):
+            lap = usual
+        recent.append(lap)
+        yield lap
 
 
-def train(cfg, scene, run, saved=None):
-    """Trains until cfg.steps or cfg.minutes; writes log.jsonl and checkpoint.pt below run. saved: a
+def check_finite(model):
+    check(all(p.isfinite().all() for p in model.parameters()),
+          "weights are no longer finite: correct the poses, or try a third of the learning rates "
+          "--lr_grid and --lr_net; an older checkpoint.pt, if any, is still there")
+
+
+def train(cfg, scene, run, saved=None, processes=ALONE):
+    """Trains until cfg.steps or cfg.minutes; writes checkpoint.pt and log.jsonl below run. saved: a
     checkpoint to go on from. Returns model and state."""
-    os.makedirs(run, exist_ok=True)
     print(f"{GeoNVS.name} on {scene.info['scene']}: {len(scene.wh)} photos, "
           f"{len(scene.test)} held out; {scene.c2w.device}; {run}/")
     torch.set_flush_denormal(True)  # vanishing weights would otherwise slow a CPU down
     torch.manual_seed(cfg.seed)
-    gen = torch.Generator(scene.c2w.device).manual_seed(cfg.seed + RANK)
+    gen = torch.Generator(scene.c2w.device).manual_seed(cfg.seed + processes.rank)
     with gen.device:
         model = GeoNVS(cfg, scene)
     optimizer = make_optimizer(model)
     state = State()
-    if saved:
-        optimizer, state = restore(saved, model, gen)
-    done = share_done(cfg, state)
-    if done >= MASK_TRAINING:  # as --steps may have been given anew
-        model.decide_mask()
+    if saved:  # the first process goes on with its random numbers, the others begin theirs again
+        optimizer, state = restore(saved, model, gen if processes.is_first else None)
+        if not processes.is_first:
+            model.sdf.octree.cell_error.zero_()  # what the first one has is of all
+    done = state.share_done(cfg)
+    if done >= MASK_TRAINING:  # again, as --steps and --mask may have been given anew
+        model.decide_mask(processes)
     if done >= 1:
         model.after_training()
-    if done < 1 and RANK == 0:
-        remove_results(run, () if saved else PROGRESS)
-        rewind_log(run / "log.jsonl", state.step)
-    meter = metered_joules(gen.device, state.joules)
+        return model, state
+    if saved and processes.is_first:
+        for name in RESULTS:  # of the shorter training
+            (run / name).unlink(missing_ok=True)
+        shutil.rmtree(run / "held_out", ignore_errors=True)
+        atomic_write(run / "log.jsonl", lambda part: part.write_text("".join(state.log)))
+    meter = metered_joules(gen.device, state.joules, processes)
     next(meter, None)  # it counts from here
-    begin = time.perf_counter() - state.seconds
+    laps = lap_times()
+    seconds = state.seconds + next(laps)
     next_log = 0.0
+    caught = []
     is_stopped = False
-    with postponed_signals() as signals:
+    with on_signals(lambda number, _: caught.append(number)):
         while done < 1 and not is_stopped:
-            terms = training_step(model, optimizer, state.step, done, gen)
+            terms = training_step(model, optimizer, state.step, done, gen, processes)
             state.step += 1
+            seconds += next(laps)
             # several processes agree now and then, and at the last step
-            if RANKS == 1 or state.step % 16 == 0 or state.step == cfg.steps:
-                seconds = time.perf_counter() - begin
-                state.seconds, is_stopped = from_first_process((seconds, len(signals) > 0))
+            if processes.count == 1 or state.step % 16 == 0 or state.step == cfg.steps:
+                state.seconds, is_stopped = processes.share((seconds, len(caught) > 0))
             before = done
-            done = share_done(cfg, state)
+            done = state.share_done(cfg)
             if any(before < share <= done for share in REFINE_AT):
-                model.refine(optimizer)
-            if before < MASK_TRAINING <= done:
-                model.decide_mask()
+                model.refine(optimizer, processes)
             if done >= 1:
                 model.after_training()
-            is_last = done >= 1 or is_stopped
-            if RANK == 0 and (is_last or state.seconds >= next_log):
-                next_log = state.seconds + PAUSE
-                state.joules = next(meter, None)  # None, never 0, once a counter has failed
-                check_finite(model, run)
-                report(run / "log.jsonl", done, state, terms)
-                save_checkpoint(run / "checkpoint.pt", model, optimizer, gen, state)
-    if is_stopped or (signals and RANK == 0):
+            if done >= 1 or is_stopped or state.seconds >= next_log:  # in all processes at once
+                next_log = state.seconds + LOG_EVERY
+                check_finite(model)
+                if processes.is_first:
+                    state.joules = next(meter, None)  # None, never 0, once a counter has failed
+                    save(run, model, optimizer, gen, state, terms, done)
+            if before < MASK_TRAINING <= done:  # it prints, so the checkpoint comes first
+                model.decide_mask(processes)
+    if caught or is_stopped:
         raise KeyboardInterrupt(
             f"stopped; step {state.step} is saved, and the same command with --resume goes on")
     return model, state
 
 
-def remove_results(run, more):
-    """Nothing of a former training may be taken for this one's."""
-    for name in (*RESULTS, *more):
-        (run / name).unlink(missing_ok=True)
-    shutil.rmtree(run / "held_out", ignore_errors=True)
-
-
-def rewind_log(path, step):
-    """Leaves out lines after a step, which a killed process wrote, and a torn one."""
-    if not path.exists():
-        return
-    lines = path.read_text().splitlines(keepends=True)
-    whole = [line for line in lines if line.endswith("}\n")]
-    kept = [line for line in whole if json.loads(line)["step"] <= step]
-    atomic_write(path, lambda part: part.write_text("".join(kept)))
-
-
-def check_finite(model, run):
-    """Ends a run that diverges, before its checkpoint is replaced."""
-    check(all(p.isfinite().all() for p in model.parameters()),
-          "weights are no longer finite: correct the poses, or try a third of the learning rates "
-          f"--lr_grid and --lr_net; checkpoint.pt in {run}, if any, is from before")
-
-
-def report(path, done, state, terms):
-    """A line on the terminal and one in log.jsonl. psnr: of the step's rays, people included."""
-    numbers = {key: value.item() for key, value in terms.items()}
-    numbers["psnr"] = -10 * math.log10(numbers["mse"] + 1e-10)
-    with open(path, "a") as file:
-        print(json.dumps(vars(state) | numbers), file=file)
-    print(f"  {min(done, 1):4.0%}  step {state.step}  psnr {numbers['psnr']:.2f}", flush=True)
-
-
 # ---- 10 Scoring, mesh, pictures ------------------------------------------------------------------
 
 RENDER_RAYS = dict(cpu=2**10, cuda=2**14)  # rendered at a time: 2 GB on a GPU
+FRAMES = 96  # of a film
 
 
 def to_uint8(picture):
@@ -1589,23 +1590,11 @@ def psnr(error):
     return -10 * math.log10(mse + 1e-10)
 
 
-def make_lpips():
-    """The network of LPIPS, a learned perceptual distance (AlexNet, v0.1), on the CPU like the
-    pictures that are scored; or None with a line."""
-    try:
-        import lpips
-        return lpips.LPIPS(net="alex", verbose=False)
-    except Exception as error:  # not installed, or its weights cannot be fetched
-        print(f"  lpips is null ({error}): pip install lpips, and internet for its weights")
-        return None
-
-
 def fit_codes(model, scene, photos, steps=128, n=64):
     """Appearance codes (B,A) of unseen photos (B,): Adam on n random rays a step of each left half,
     from the mean code of the training photos. The scene stays as it is."""
     gen = torch.Generator(photos.device).manual_seed(0)
-    mean = model.codes()[scene.train].mean(0)  # (A,)
-    codes = mean.repeat(len(photos), 1)  # (B,A)
+    codes = model.codes()[scene.train].mean(0).repeat(len(photos), 1)  # (B,A)
     if codes.numel() == 0:
         return codes
     adam = torch.optim.Adam([codes.requires_grad_()])
@@ -1615,17 +1604,10 @@ def fit_codes(model, scene, photos, steps=128, n=64):
         rays = random_rays(scene, img, gen, part=0.5)
         rgb = model.render(rays, codes.repeat_interleave(n, 0))["rgb"]
         residual = (rgb - rays.rgb).abs() * ~rays.is_masked[:, None]  # (Bn,3)
-        loss = residual.mean()
         adam.zero_grad()
-        loss.backward(inputs=codes)  # the model's weights get no gradient
+        residual.mean().backward(inputs=codes)  # the model's weights get no gradient
         adam.step()
     return codes.detach()
-
-
-def write_png(path, picture):
-    """An RGB picture (H,W,3) of bytes; encoded here, as cv2 cannot open every path."""
-    _, data = cv2.imencode(".png", picture[..., ::-1])
-    atomic_write(path, lambda part: part.write_bytes(data))
 
 
 def photo_rays(scene, photo):
@@ -1640,39 +1622,40 @@ def render_photo(model, scene, photo, code):
     as the ray's opacity, each (H,W,3), and depth (H,W), along the ray."""
     w, h = scene.wh[photo].tolist()
     parts = []
-    for pixel in torch.arange(w * h, device=code.device).split(RENDER_RAYS[code.device.type]):
-        rays = make_rays(scene, torch.full_like(pixel, photo), pixel)
-        out = model.render(rays, code.expand(len(pixel), -1))
-        columns = [out["rgb"], rays.rgb, out["normal"], out["depth"][:, None]]
-        parts.append(torch.cat(columns, 1))  # (R,10)
+    columns = photo_rays(scene, photo)
+    for part in zip(*[column.split(RENDER_RAYS[code.device.type]) for column in columns]):
+        rays = Rays(*part)
+        out = model.render(rays, code.expand(len(rays.o), -1))
+        parts.append(torch.cat([out["rgb"], rays.rgb, out["normal"], out["depth"][:, None]], 1))
     picture = torch.cat(parts).reshape(h, w, 10).cpu().numpy()
     rgb, truth, normal, depth = np.split(picture, [3, 6, 9], axis=2)
     return rgb, truth, normal, depth[..., 0]
 
 
-def score(rgb, truth, lpips=None):
+def score(rgb, truth, masked, lpips=None):
     """The right half of a rendered photo, rounded to 8 bits, against the truth, beside a baseline
-    (psnr_floor): each row of pixels in the mean colour of its left half. SSIM: Gaussian window
-    of 11 px, sigma 1.5, no border. None where a picture is too small. Pixels that a user's mask
-    excludes count as all others do."""
+    (psnr_floor): each row of pixels in the mean colour of its left half. SSIM has a Gaussian window
+    of 11 px with sigma 1.5 and no border. Pixels that a user's mask excludes, masked (H,W), are
+    left out. None where a picture is too small, or nothing is left of it."""
     half = truth.shape[1] // 2
+    weight = ~masked[:, :half, None] + 1e-9  # so that a row without pixels has a mean, too
+    floor = np.average(truth[:, :half], 1, np.broadcast_to(weight, truth[:, :half].shape))
     want = truth[:, half:]
+    is_scored = ~masked[:, half:]
     got = to_uint8(rgb[:, half:]) / 255
-    side = min(got.shape[:2])
-    row = dict(
-        psnr=psnr(got - want),
-        psnr_floor=psnr(truth[:, :half].mean(1, keepdims=True) - want),
-        ssim=None,
-        lpips=None)
-    if side >= 11:
-        row["ssim"] = structural_similarity(
-            got,
-            want,
-            channel_axis=2,
-            data_range=1,
-            gaussian_weights=True,
-            use_sample_covariance=False)
-    if lpips and side >= 32:
+    got = np.where(is_scored[..., None], got, want)  # no window sees a difference in the others
+    row = dict(psnr=None, psnr_floor=None, ssim=None, lpips=None)
+    row["masked_pixels"] = int((~is_scored).sum())
+    side = min(is_scored.shape)
+    if is_scored.any():
+        row["psnr"] = psnr((got - want)[is_scored])
+        row["psnr_floor"] = psnr((floor[:, None] - want)[is_scored])
+    if side >= 11 and is_scored[5:-5, 5:-5].any():
+        _, ssim = structural_similarity(
+            got, want, channel_axis=2, data_range=1, gaussian_weights=True,
+            use_sample_covariance=False, full=True)  # (H,W/2,3)
+        row["ssim"] = ssim[5:-5, 5:-5][is_scored[5:-5, 5:-5]].mean()
+    if lpips and side >= 32 and is_scored.any():
         a, b = [torch.tensor(x).float().permute(2, 0, 1)[None] for x in (got, want)]  # (1,3,H,W)
         row["lpips"] = lpips(a, b, normalize=True).item()
     return row
@@ -1688,77 +1671,35 @@ def evaluate(model, scene, lpips=None, folder=None):
     rows = []
     for photo in progress(scene.test.tolist(), "scoring held-out photos"):
         rgb, truth, _, _ = render_photo(model, scene, photo, codes[photo])
+        masked = photo_rays(scene, photo).is_masked.reshape(truth.shape[:2]).cpu().numpy()
         name = str(scene.raw["name"][photo])
-        row = score(rgb, truth, lpips)
-        row["name"] = name
-        rows.append(row)
+        rows.append(score(rgb, truth, masked, lpips) | dict(name=name))
         if folder:
             path = Path(folder, name.removesuffix(".png") + ".png")
-            write_png(path, to_uint8(np.hstack([truth, rgb])))
+            if len(os.fsencode(path.name)) > 255:  # the most that file systems take
+                path = path.with_name(f"{path.name[:40]}~{zlib.crc32(os.fsencode(name)):08x}.png")
+            write_picture(path, lambda: to_uint8(np.hstack([truth, rgb])))
     scores = dict(per_image=rows)
     for key in ("psnr", "psnr_floor", "ssim", "lpips"):
         values = [row[key] for row in rows if row[key] is not None]
         scores[key] = np.mean(values) if values else None
+    scores["masked_pixels"] = sum(row["masked_pixels"] for row in rows) if rows else None
     return scores, codes
-
-
-def mask_mean(mask, chosen):
-    """Mean of M (P,) over chosen pixels (P,); None if there are none."""
-    return float(mask[chosen].mean()) if chosen.any() else None
-
-
-def depth_edges(depth):
-    """Whether a pixel of depth (H,W), distances along rays, lies beside a jump: the second
-    difference of inverse depth, nearly 0 on a plane, exceeds 5 % of the largest of the three."""
-    inverse = 1 / depth.astype(np.float32)  # 0: sky
-    edges = np.zeros(depth.shape, bool)
-    for q, is_edge in (inverse, edges), (inverse.T, edges.T):  # down, then across
-        before, here, after = q[:-2], q[1:-1], q[2:]
-        bend = np.abs(2 * here - before - after)
-        is_edge[1:-1] |= bend > 0.05 * np.maximum(here, np.maximum(before, after))
-    return edges
 
 
 @torch.no_grad()
 def toy_truth(model, scene):
-    """What only a toy can tell. sdf_error: mean |s - s_true| near visible walls, scene units;
-    normal_error: median angle at walls, degrees, by taps of 0.004. mask_iou: M > 0.5 against the
-    true occluders of training photos. False positives, mean M on static pixels: mask_static of all,
-    mask_edges of those beside a jump of depth, mask_flat of the others, mask_sky of the sky. None
-    without a mask."""
-    raw = scene.raw
-    near, sdf, wall, normal = [
-        torch.as_tensor(raw[name]).to(scene.c2w)
-        for name in ("near_wall", "near_wall_sdf", "wall", "wall_normal")]
-    _, grad, _ = model.sdf.derivatives(wall, 0.004)
-    cos = F.cosine_similarity(grad, normal).clamp(-1, 1)
-    truth = dict(
-        sdf_error=(model.distance(near) - sdf).abs().mean().item(),
-        normal_error=cos.acos().rad2deg().median().item(),
-        mask_iou=None,
-        mask_static=None,
-        mask_edges=None,
-        mask_flat=None,
-        mask_sky=None)
-    if model.cfg.mask == "off":
-        return truth
-    masks = [
-        sample_logits(model.mask.logits([photo]), photo_rays(scene, photo).uv).sigmoid()
-        for photo in scene.train.tolist()]
-    mask = torch.cat(masks).cpu().numpy()
-    is_train = np.repeat(~raw["is_test"], np.diff(raw["start"]))  # by pixel
-    people = raw["occluder"][is_train]
-    depths = zip(np.split(raw["depth"], raw["start"][1:-1]), raw["wh"])
-    edges = [depth_edges(depth.reshape(h, w)).ravel() for depth, (w, h) in depths]
-    edges = np.concatenate(edges)[is_train]
-    truth["mask_static"] = mask_mean(mask, ~people)
-    truth["mask_edges"] = mask_mean(mask, ~people & edges)
-    truth["mask_flat"] = mask_mean(mask, ~people & ~edges)
-    truth["mask_sky"] = mask_mean(mask, ~people & np.isinf(raw["depth"][is_train]))
-    if people.any():
-        found = mask > 0.5
-        truth["mask_iou"] = (found & people).sum() / (found | people).sum()
-    return truth
+    """Errors of surface and mask that only a toy can tell: see data_prep.toy_truth."""
+    near, wall = [torch.as_tensor(scene.raw[key]).to(scene.c2w) for key in ("near_wall", "wall")]
+    _, gradient, _ = model.sdf.derivatives(wall, 0.004)
+    mask = None
+    if model.has_mask:
+        masks = [
+            sample_logits(model.mask.logits([photo]), photo_rays(scene, photo).uv).sigmoid()
+            for photo in scene.train.tolist()]
+        mask = torch.cat(masks).cpu().numpy()
+    sdf = model.distance(near).cpu().numpy()
+    return data_prep.toy_truth(scene.raw, sdf, gradient.cpu().numpy(), mask)
 
 
 def extract_mesh(model):
@@ -1778,9 +1719,8 @@ def extract_mesh(model):
     if len(np.unique(volume[is_inside] < 0)) < 2:
         return [np.zeros((0, 3))] * 2
     vertices, faces, _, _ = marching_cubes(volume, 0, mask=is_inside)
-    vertices = vertices * (2 / n) - 1
     raw = model.scene.raw
-    return vertices * raw["scale"] + raw["center"], faces
+    return (vertices * (2 / n) - 1) * raw["scale"] + raw["center"], faces
 
 
 @torch.no_grad()
@@ -1800,30 +1740,12 @@ def mesh_colors(model, vertices):
     return in_chunks(colors, torch.as_tensor(x).to(scene.c2w)).cpu().numpy()
 
 
-def write_ply(path, vertices, faces, colors):
-    """A binary PLY file; coordinates are doubles, as floats would round those of a map."""
-    vertex_type = [("xyz", "<f8", 3), ("rgb", "u1", 3)]
-    vertex = np.empty(len(vertices), vertex_type)
-    vertex["xyz"] = vertices
-    vertex["rgb"] = to_uint8(colors)
-    face = np.empty(len(faces), [("count", "u1"), ("corner", "<i4", 3)])
-    face["count"] = 3
-    face["corner"] = faces
-    header = f"""ply
-format binary_little_endian 1.0
-element vertex {len(vertices)}
-property double x
-property double y
-property double z
-property uchar red
-property uchar green
-property uchar blue
-element face {len(faces)}
-property list uchar int vertex_indices
-end_header
-"""
-    data = header.encode() + vertex.tobytes() + face.tobytes()
-    atomic_write(path, lambda part: part.write_bytes(data))
+def write_picture(path, draw):
+    """Writes the picture that draw() returns. One that fails is a line, not the end of a run."""
+    try:
+        write_png(path, draw())
+    except Exception as error:
+        print(f"  no {path.name}: {error!r:.200}")
 
 
 def depth_picture(depth, opacity):
@@ -1836,18 +1758,17 @@ def depth_picture(depth, opacity):
     return (color * opacity[..., None]).astype(np.uint8)
 
 
-def write_panel(path, model, scene, codes):
-    """A row for two held-out photos and two of training: photo, render under codes (I,A), normals
-    and depth of the surface, and what the mask network says of the photo."""
+def draw_panel(model, scene, codes):
+    """A picture with a row for two held-out photos and two of training: photo, render under codes
+    (I,A), normals and depth of the surface, and M of the whole photo."""
     rows = []
     for photo in scene.test[:2].tolist() + scene.train[:2].tolist():
         rgb, truth, normal, depth = render_photo(model, scene, photo, codes[photo])
         tiles = [to_uint8(tile) for tile in (truth, rgb, normal / 2 + 0.5)]
-        opacity = np.linalg.norm(normal, axis=2)
-        tiles.append(depth_picture(depth, opacity))
+        tiles.append(depth_picture(depth, np.linalg.norm(normal, axis=2)))
         kind = "held out" if photo in scene.test else "training"
         text = f"{kind}: {scene.raw['name'][photo]}, render, normals, depth (red: near)"
-        if model.cfg.mask != "off":
+        if model.has_mask:
             M = model.mask.logits([photo])[0, 0].detach().sigmoid().cpu()  # (m,m)
             tiles.append(to_uint8(np.dstack([M] * 3)))
             text += ", mask (white: transient)"
@@ -1857,90 +1778,7 @@ def write_panel(path, model, scene, codes):
         row = np.insert(np.hstack(row), [0] * 20, 255, axis=0)  # 20 white lines for the title
         cv2.putText(row, text, (2, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.4, 0)
         rows.append(row)
-    write_png(path, np.vstack(rows))
-
-
-def peak_memory(device):
-    """Most bytes in use at a time, of the GPU, else of this process; None on Windows."""
-    if device.type == "cuda":
-        return torch.cuda.max_memory_allocated()
-    try:
-        import resource
-    except ImportError:
-        return None
-    unit = 1 if sys.platform == "darwin" else 1024  # bytes
-    return unit * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-
-
-def model_bytes(model):
-    """Bytes of parameters and of the octrees' buffers."""
-    tensors = list(model.parameters())
-    for octree in model.octrees:
-        tensors += octree.buffers()
-    return sum(tensor.nbytes for tensor in tensors)
-
-
-def code_version():
-    """The commit of this file; None without git."""
-    folder = str(Path(__file__).parent)
-    command = ["git", "-C", folder, "describe", "--always", "--dirty"]
-    try:
-        answer = subprocess.run(command, capture_output=True, text=True)
-    except OSError:  # git is not installed
-        return None
-    return answer.stdout.strip() or None
-
-
-def describe_run(model, scene, state):
-    """What metrics.json says beside scores: what was trained, how long, on which machine."""
-    machine = f"cpu, {torch.get_num_threads()} threads"
-    if scene.c2w.is_cuda:
-        machine = torch.cuda.get_device_name()
-    joules = state.joules
-    is_metered = joules is not None
-    return dict(
-        scene=scene.info["scene"],
-        method=model.name,
-        seed=model.cfg.seed,
-        steps=state.step,
-        device=machine,
-        train_seconds=state.seconds,
-        energy_wh=joules / 3600 if is_metered else None,
-        energy_source=f"the device's counter, read every {PAUSE} s" if is_metered else None,
-        rays_per_second=state.step * model.cfg.rays / state.seconds,
-        parameters=sum(p.numel() for p in model.parameters()),
-        model_bytes=model_bytes(model),
-        protocol="appearance fitted on the left half, scored on the right half",
-        torch=torch.__version__,
-        commit=code_version(),
-        config=vars(model.cfg))
-
-
-def write_mesh(path, model):
-    vertices, faces = extract_mesh(model)
-    if len(faces) == 0:
-        print(f"  {path} is empty: no surface lies in the unit sphere; train longer")
-    write_ply(path, vertices, faces, mesh_colors(model, vertices))
-
-
-def finish(model, scene, state, run):
-    """Scores a trained model; writes pictures, mesh, codes and metrics.json below run. Returns the
-    metrics, and prints those that are one number with a fraction."""
-    peak = peak_memory(scene.c2w.device)  # before scoring
-    scores, codes = evaluate(model, scene, make_lpips(), run / "held_out")
-    atomic_write(run / "codes.npy", lambda part: np.save(part, codes.cpu()))
-    write_panel(run / "panel.png", model, scene, codes)
-    if model.octrees:  # baselines of test_geonvs.py have none
-        scores["octree_cells"] = model.sdf.octree.cells[:, 0].bincount().tolist()  # by level
-        write_mesh(run / "mesh.ply", model)
-        if "wall" in scene.raw:  # the toy
-            scores |= toy_truth(model, scene)
-    metrics = scores | describe_run(model, scene, state) | dict(peak_memory_bytes=peak)
-    atomic_write(run / "metrics.json", lambda part: part.write_text(json.dumps(metrics, indent=1)))
-    for key, value in metrics.items():
-        if isinstance(value, float):
-            print(f"  {key} {value:.4g}")
-    return metrics
+    return np.vstack(rows)
 
 
 def film(model, scene, path):
@@ -1952,19 +1790,92 @@ def film(model, scene, path):
     with tempfile.TemporaryDirectory() as folder:  # as cv2 cannot open every path
         part = Path(folder, "film.mp4")
         video = cv2.VideoWriter(str(part), cv2.VideoWriter_fourcc(*"vp09"), 24, size)
-        check(video.isOpened(), "OpenCV cannot encode VP9: pip install --upgrade "
-              "opencv-contrib-python-headless")
-        for n in progress(range(96), "filming 96 frames"):
-            phase = n / 95
+        for n in progress(range(FRAMES), f"filming {FRAMES} frames"):
+            phase = n / (FRAMES - 1)
             c2w = scene.c2w.clone()
             c2w[..., 3] += 0.1 * math.sin(math.tau * phase) * c2w[..., 0]
             view = scene._replace(c2w=c2w)
             rgb, _, _, _ = render_photo(model, view, photo, first.lerp(last, phase))
             video.write(to_uint8(rgb[..., ::-1]))
         video.release()
+        video = cv2.VideoCapture(str(part))  # read back, as a writer says nothing of a full disk
+        count = sum(1 for _ in iter(lambda: video.read()[0], False))
+        check(count == FRAMES, f"{count} of {FRAMES} frames were written: make room in {folder}, "
+              "or pip install --upgrade opencv-contrib-python-headless, which encodes VP9")
         data = part.read_bytes()
     atomic_write(path, lambda part: part.write_bytes(data))
     print(f"wrote {path}")
+
+
+def make_lpips():
+    """The network of LPIPS, a learned perceptual distance (AlexNet, v0.1), on the CPU like the
+    pictures that are scored; or None with a line."""
+    try:
+        import lpips
+        return lpips.LPIPS(net="alex", verbose=False)
+    except Exception as error:  # not installed, or its weights cannot be fetched
+        print(f"  lpips is null ({error}): pip install lpips, and internet for its weights")
+
+
+def peak_memory(is_cuda):
+    """Most bytes in use at a time, of the GPU, else of this process; None on Windows."""
+    if is_cuda:
+        return torch.cuda.max_memory_allocated()
+    with contextlib.suppress(ImportError):
+        import resource
+        unit = 1 if sys.platform == "darwin" else 1024  # bytes
+        return unit * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+
+
+def code_version():
+    """The commit of this file; None without git."""
+    command = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty"]
+    with contextlib.suppress(OSError):  # git is not installed
+        return subprocess.run(command, capture_output=True, text=True).stdout.strip() or None
+
+
+def finish(model, scene, state, run, processes=ALONE):
+    """Scores a trained model; writes codes, mesh, metrics and pictures below run. Returns the
+    metrics, and prints those that are one number with a fraction."""
+    is_metered = state.joules is not None
+    is_cuda = scene.c2w.is_cuda
+    threads = f"cpu, {torch.get_num_threads()} threads"
+    buffers = [tensor for octree in model.octrees for tensor in octree.buffers()]
+    metrics = dict(
+        scene=scene.info["scene"],
+        method=model.name,
+        seed=model.cfg.seed,
+        steps=state.step,
+        device=torch.cuda.get_device_name() if is_cuda else threads,
+        train_seconds=state.seconds,
+        energy_wh=state.joules / 3600 if is_metered else None,
+        energy_source=f"the device's counter, read every {LOG_EVERY} s" if is_metered else None,
+        rays_per_second=processes.count * model.cfg.rays * state.step / state.seconds,
+        parameters=sum(p.numel() for p in model.parameters()),
+        model_bytes=sum(tensor.nbytes for tensor in [*model.parameters(), *buffers]),
+        peak_memory_bytes=peak_memory(is_cuda),  # before scoring
+        protocol="appearance fitted on the left half, scored on the right half",
+        has_mask=model.has_mask,
+        torch=torch.__version__,
+        commit=code_version(),
+        config=vars(model.cfg))
+    scores, codes = evaluate(model, scene, make_lpips(), run / "held_out")
+    metrics |= scores
+    atomic_write(run / "codes.npy", lambda part: np.save(part, codes.cpu()))
+    if model.octrees:  # baselines of test_geonvs.py have none
+        metrics["octree_cells"] = model.sdf.octree.cells[:, 0].bincount().tolist()  # by level
+        vertices, faces = extract_mesh(model)
+        if len(faces) == 0:
+            print(f"  {run}/mesh.ply is empty: no surface lies in the unit sphere; train longer")
+        write_ply(run / "mesh.ply", vertices, faces, to_uint8(mesh_colors(model, vertices)))
+        if "wall" in scene.raw:
+            metrics |= toy_truth(model, scene)
+    atomic_write(run / "metrics.json", lambda part: part.write_text(json.dumps(metrics, indent=1)))
+    write_picture(run / "panel.png", lambda: draw_panel(model, scene, codes))
+    for key, value in metrics.items():
+        if isinstance(value, float):
+            print(f"  {key} {value:.4g}")
+    return metrics
 
 
 # ---- 11 Command line -----------------------------------------------------------------------------
@@ -1972,28 +1883,30 @@ def film(model, scene, path):
 def make_parser():
     parser = argparse.ArgumentParser(
         description=__doc__.splitlines()[0],
-        epilog=f"[Dn]: see geonvs.py's head. Photos on a GPU: {GPU_DEFAULTS}",
+        epilog=f"[Dn]: see the head of geonvs.py. Photos on a GPU: {GPU_DEFAULTS}",
         usage=argparse.SUPPRESS)  # so a mistake ends in one sentence
-    comments = dict(re.findall(r"(\w+): .+  # (.+)", inspect.getsource(Config)))
-    for setting in fields(Config):
-        parser.add_argument(
-            f"--{setting.name}",
-            type=setting.type,
-            choices=CHOICES.get(setting.name),
-            default=argparse.SUPPRESS,  # for make_config, which has to know what was given
-            help=f"{comments[setting.name]} [{setting.default}]")
     parser.add_argument("--resume", action="store_true", help="go on from the run's checkpoint")
     parser.add_argument("--render", action="store_true", help="film a finished run")
+    for option in fields(Config):
+        if option.name in GROUPS:
+            group = parser.add_argument_group(GROUPS[option.name])
+        group.add_argument(
+            f"--{option.name}",
+            type=option.type,
+            metavar=option.type.__name__.upper(),
+            default=argparse.SUPPRESS,  # for make_config, which has to know what was given
+            help=f"{option.metadata['meaning']} [{option.default}]".removesuffix(" []"))
     return parser
 
 
-def pick_device(name):
+def pick_device(name, processes=ALONE):
     """The device of this process: with torchrun each has its own GPU."""
     count = torch.cuda.device_count()
+    number = processes.local_rank
     if name == "cpu" or (name == "auto" and count == 0):
         return torch.device("cpu")
-    check(LOCAL_RANK < count, f"--device cuda: {count} GPUs are here for {RANKS} processes")
-    return torch.device("cuda", LOCAL_RANK)
+    check(number < count, f"process {number + 1} has no GPU: there are {count}; use --device cpu")
+    return torch.device("cuda", number)
 
 
 def make_config(given):
@@ -2002,38 +1915,6 @@ def make_config(given):
     if cfg.source != "toy" and pick_device(cfg.device).type == "cuda":
         cfg = Config(**GPU_DEFAULTS | given)
     return cfg
-
-
-def start_processes(device):
-    """Joins the processes that torchrun started; the first one speaks."""
-    check("MASTER_ADDR" in os.environ, "start processes by torchrun, or unset WORLD_SIZE")
-    has_nccl = device.type == "cuda" and dist.is_nccl_available()  # not on Windows
-    dist.init_process_group("cpu:gloo,cuda:nccl" if has_nccl else "gloo")
-    if RANK > 0:
-        sys.stdout = open(os.devnull, "w", errors="replace")
-
-
-def refuse_used(run):
-    """A run is hours of work: only its owner replaces it."""
-    for name in ("checkpoint.pt", "metrics.json"):
-        check(not (run / name).exists(), f"{run} holds a run already: go on with it by --resume, "
-              "train beside it by --name NAME, or delete the folder to replace it")
-
-
-@contextlib.contextmanager
-def locked(run):
-    """No other process trains in a folder meanwhile. The system ends a lock with its process."""
-    os.makedirs(run, exist_ok=True)
-    try:  # of the standard library, only SQLite locks files on every system
-        lock = sqlite3.connect(run / ".lock", timeout=0)
-        lock.executescript("PRAGMA journal_mode = OFF; BEGIN EXCLUSIVE")
-    except sqlite3.OperationalError as error:
-        raise UserError(f"{run} is in use by another training, or its disk cannot be written or "
-                        f"locked ({error}): wait, or train beside it by --name NAME")
-    with contextlib.closing(lock):
-        for part in run.glob(".checkpoint.*.pt"):  # half-written, of a killed process
-            part.unlink()
-        yield
 
 
 def main(argv=None):
@@ -2051,50 +1932,56 @@ def main(argv=None):
         return
     saved = None
     if resume:
-        _, cfg = read_checkpoint(run / "checkpoint.pt", given)
-    else:
-        refuse_used(run)
-    check(cfg.rays % (cfg.photos * RANKS) == 0,
-          f"--rays {cfg.rays} must be a multiple of --photos {cfg.photos} times {RANKS} processes")
-    device = pick_device(cfg.device)
-    if RANKS > 1:
-        start_processes(device)
-        if RANK == 0:
+        saved, cfg = read_checkpoint(run / "checkpoint.pt", given)
+    for file in ("checkpoint.pt", "metrics.json", "log.jsonl"):
+        check(resume or not (run / file).exists(), f"{run} holds a run already: go on with it by "
+              "--resume, train beside it by --name NAME, or delete the folder to replace it")
+    check(cfg.rays % cfg.photos == 0,
+          f"--rays {cfg.rays} must be a multiple of --photos {cfg.photos}")
+    processes = ALONE
+    if os.environ.get("WORLD_SIZE", "1") != "1":  # torchrun says so
+        numbers = [os.environ.get(key, 0) for key in ("WORLD_SIZE", "RANK", "LOCAL_RANK")]
+        processes = Processes(*map(int, numbers))
+    device = pick_device(cfg.device, processes)
+    if processes.count > 1:
+        processes.join(device)
+        if processes.is_first:
             read_scene(cfg)  # the others find it made
         dist.barrier()
     scene = load_scene(read_scene(cfg), device)
-    with locked(run) if RANK == 0 else contextlib.nullcontext():
-        if resume:
-            saved, cfg = read_checkpoint(run / "checkpoint.pt", given)  # nobody else writes now
-        elif RANK == 0:
-            refuse_used(run)  # what ended since is a run, too
-        model, state = train(cfg, scene, run, saved)
-        if RANK == 0:
-            finish(model, scene, state, run)
-    if RANKS > 1:
+    model, state = train(cfg, scene, run, saved, processes)
+    if processes.is_first:
+        try:
+            finish(model, scene, state, run, processes)
+        except Exception as error:
+            check(not is_memory_full(error), "the memory is full, but the training is saved: end "
+                  "other programs, then go on with --resume")
+            raise
+    if processes.count > 1:
         dist.destroy_process_group()
 
 
 def run_command_line(entry):
     """Exit code 0, or 2 with one sentence on stderr; a bug keeps its traceback."""
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, signal.default_int_handler)
     data_prep.allow_any_character()
-    try:
-        entry()
-        return
-    except UserError as error:
-        message = str(error)
-    except OSError as error:  # a full disk, a folder without permission
-        message = (f"{error}: make room or choose another place; a run that has a checkpoint goes "
-                   "on with --resume")
-    except (RuntimeError, MemoryError) as error:  # a CPU's allocator has no error of its own
-        if isinstance(error, RuntimeError) and "allocate" not in str(error):
-            raise
-        message = "the memory is full: begin anew with fewer --rays or a larger --downscale"
-    except KeyboardInterrupt as stop:
-        message = str(stop) or "stopped; a run that has a checkpoint goes on with --resume"
-    data_prep.warn(f"error: {message}")
+    with on_signals(signal.default_int_handler):
+        try:
+            entry()
+            return
+        except UserError as error:
+            message = str(error)
+        except OSError as error:  # a full disk, a folder without permission
+            message = (f"{error}: make room, or choose another place or --name; a run that has a "
+                       "checkpoint goes on with --resume")
+        except KeyboardInterrupt as stop:
+            message = str(stop) or "stopped; a run that has a checkpoint goes on with --resume"
+        except Exception as error:
+            if not is_memory_full(error):
+                raise
+            message = ("the memory is full: begin anew with fewer --rays or a larger --downscale; "
+                       "a run that has a checkpoint goes on with --resume")
+    with contextlib.suppress(OSError):  # the terminal may be closed
+        data_prep.warn(f"error: {message}")
     sys.exit(2)
 
 
