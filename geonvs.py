@@ -91,7 +91,7 @@ from data_prep import (
 torch.set_float32_matmul_precision("highest")
 
 
-# ---- 1 Settings: every field of Config is a flag -------------------------------------------------
+# ---- 1 Settings, whose fields are flags, and processes -------------------------------------------
 
 def setting(default, meaning, least=0, choices=()):
     """A field of Config: its meaning for --help, its least value, or the values it may have."""
@@ -165,6 +165,53 @@ GPU_DEFAULTS = dict(
     photos=16,
     samples=32,
     appearance_dim=32)
+
+
+@dataclass
+class Processes:
+    """The processes that torchrun started, or this one alone. Each draws its own rays and follows
+    its own quantiles. Gradients are averaged, and the first process decides, speaks and writes; so
+    all hold the same weights."""
+    count: int = 1
+    rank: int = 0
+    local_rank: int = 0  # on this machine: the number of the process's GPU
+
+    @property
+    def is_first(self):
+        return self.rank == 0
+
+    def join(self, device):
+        """Connects this process with the others; those are silent."""
+        check("MASTER_ADDR" in os.environ, "start processes by torchrun, or unset WORLD_SIZE")
+        has_nccl = device.type == "cuda" and dist.is_nccl_available()  # not on Windows
+        if device.type == "cuda":
+            torch.cuda.set_device(device)
+        dist.init_process_group("cpu:gloo,cuda:nccl" if has_nccl else "gloo")
+        if not self.is_first:
+            sys.stdout = open(os.devnull, "w", errors="replace")
+
+    def share(self, value):
+        """The first process's value, for all of them."""
+        box = [value]
+        if self.count > 1:
+            dist.broadcast_object_list(box)
+        return box[0]
+
+    def sum(self, tensor):
+        """Adds up a tensor over processes, in place."""
+        if self.count > 1:
+            dist.all_reduce(tensor)
+
+    def average_gradients(self, model):
+        """Averages gradients over processes, in one transfer."""
+        if self.count > 1:
+            grads = [p.grad for p in model.parameters() if p.grad is not None]
+            flat = nn.utils.parameters_to_vector(grads)
+            self.sum(flat)
+            nn.utils.vector_to_parameters(flat / self.count, grads)
+
+
+ALONE = Processes()
 
 
 # ---- 2 Scene file and rays -----------------------------------------------------------------------
@@ -1231,7 +1278,7 @@ class GeoNVS(nn.Module):
             dict(name="codes", params=codes, base_lr=cfg.lr_code),
             dict(name="mask", params=mask, base_lr=cfg.lr_mask)]
 
-    def refine(self, optimizer, processes):
+    def refine(self, optimizer, processes=ALONE):
         """Splits cells where colours err; Adam's moments move along with their features. [D10]"""
         octree = self.sdf.octree
         processes.sum(octree.cell_error)
@@ -1247,7 +1294,7 @@ class GeoNVS(nn.Module):
                 group["params"] = [tree.features for tree in self.octrees]
 
     @torch.no_grad()
-    def decide_mask(self, processes):
+    def decide_mask(self, processes=ALONE):
         """--mask auto: off if M marks hardly anything in the first 64 training photos; pixels that
         a user's mask excludes count, too. [D10]"""
         if self.cfg.mask == "auto":
@@ -1266,54 +1313,7 @@ class GeoNVS(nn.Module):
         return render_rays(self, rays, code, middle, rays.o[:0])
 
 
-# ---- 8 Processes and energy ----------------------------------------------------------------------
-
-@dataclass
-class Processes:
-    """The processes that torchrun started, or this one alone. Each draws its own rays and follows
-    its own quantiles. Gradients are averaged, and the first process decides, speaks and writes; so
-    all hold the same weights."""
-    count: int = 1
-    rank: int = 0
-    local_rank: int = 0  # on this machine: the number of the process's GPU
-
-    @property
-    def is_first(self):
-        return self.rank == 0
-
-    def join(self, device):
-        """Connects this process with the others; those are silent."""
-        check("MASTER_ADDR" in os.environ, "start processes by torchrun, or unset WORLD_SIZE")
-        has_nccl = device.type == "cuda" and dist.is_nccl_available()  # not on Windows
-        if device.type == "cuda":
-            torch.cuda.set_device(device)
-        dist.init_process_group("cpu:gloo,cuda:nccl" if has_nccl else "gloo")
-        if not self.is_first:
-            sys.stdout = open(os.devnull, "w", errors="replace")
-
-    def share(self, value):
-        """The first process's value, for all of them."""
-        box = [value]
-        if self.count > 1:
-            dist.broadcast_object_list(box)
-        return box[0]
-
-    def sum(self, tensor):
-        """Adds up a tensor over processes, in place."""
-        if self.count > 1:
-            dist.all_reduce(tensor)
-
-    def average_gradients(self, model):
-        """Averages gradients over processes, in one transfer."""
-        if self.count > 1:
-            grads = [p.grad for p in model.parameters() if p.grad is not None]
-            flat = nn.utils.parameters_to_vector(grads)
-            self.sum(flat)
-            nn.utils.vector_to_parameters(flat / self.count, grads)
-
-
-ALONE = Processes()
-
+# ---- 8 Energy ------------------------------------------------------------------------------------
 
 def metered_joules(device, joules, processes=ALONE):
     """Yields the joules that the GPUs of all processes have spent since the first call, on top of
@@ -1480,7 +1480,7 @@ def load_run(run, **given):
         model = GeoNVS(cfg, scene)
     _, state = restore(saved, model)
     if state.share_done(cfg) >= MASK_TRAINING:
-        model.decide_mask(ALONE)
+        model.decide_mask()
     model.after_training()  # a run that was stopped has an older cache
     codes = model.codes()
     if (run / "codes.npy").exists():  # finished: codes of test photos are fitted
