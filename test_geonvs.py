@@ -387,6 +387,17 @@ def test_points_that_most_photos_mask_are_not_there(masked_photos, share):
     assert (scene["track_photo"] == 2).sum() == len(x)
 
 
+def test_a_sighting_is_masked_by_its_own_pixel():
+    mask = np.zeros((20, 40), bool)  # 40 px wide
+    mask[5:, 30:] = True
+    K = np.array([20, 20, 20, 10])
+    x = np.random.default_rng(0).uniform((-1, -.5, 1), (1, .5, 1), (300, 3))
+    u, v, _ = (20 * x + (20, 10, 0)).T
+    track = np.arange(0, 300, 2)
+    kept = data_prep.unmasked(track, mask, K, np.eye(3, 4), x)
+    assert np.array_equal(kept, track[~((u > 30) & (v > 5))[track]])
+
+
 def test_near_footprint_and_sightings_follow_the_points():
     xyz = ball(900)
     xyz[:100] *= 9  # most of these lie outside of the sphere
