@@ -124,8 +124,9 @@ class Config:
     hidden: int = setting(64, "width of the networks", least=1)
     appearance_dim: int = setting(16, "length of a photo's appearance code")
     appearance: str = setting("auto", "codes: on, off, auto (if exposures differ)", choices=SWITCH)
-    mask: str = setting("auto", "mask: on, off, auto (if it marks much)", choices=SWITCH)
+    mask: str = setting("on", "transient mask: on, off", choices=("on", "off"))
     background: str = setting("auto", "a field: on, off, auto (unless one colour)", choices=SWITCH)
+    paper: str = setting("", "equations as printed: alpha, phi, reg, lps, zeta")
     lam_eik: float = setting(0.004, "L_eik, eikonal (Permuto-SDF: 0.04)")
     lam_curv: float = setting(0.01, "L_curv, curvature: |lap s| eps [D2]")
     lam_mask: float = setting(1.0, "L_reg, which trains the mask [D3]")
@@ -151,6 +152,10 @@ class Config:
                       f"--{option.name} {value} is out of range: use {least} to 2^31 - 1")
         if self.data:
             self.data = os.path.realpath(self.data)  # to be found from any folder
+
+    def printed(self, name):
+        """Whether one of the equations PRINTED is to be as in the paper."""
+        return name in self.paper.split(",")
 
     @property
     def source(self):
@@ -213,19 +218,25 @@ class Processes:
 
 ALONE = Processes()
 
+# when things happen, in shares of training
+REFINE_AT = (0.1, 0.2, 0.3, 0.45, 0.6)  # the octree is refined; later there is no time to fit it
+REJECTION = 0.3  # outliers are rejected until then, while the mask does not know them yet
+ZETA_RISE = 0.43  # surfaces are soft until then: the lower bound of zeta rises
+MASK_TRAINING = 0.6  # M is fixed from then on, as errors of memorised people are small
+
 
 # ---- 2 Scene file and rays -----------------------------------------------------------------------
 
 class Scene(NamedTuple):
     """The arrays of a scene file (data_prep.py documents them) as tensors on the device."""
-    rgb: Tensor  # (N,3) uint8, all pixels of all photos
+    rgb: Tensor  # (.,3) uint8, all pixels of all photos
     start: Tensor  # (I+1,) first pixel of each photo, and the end
     wh: Tensor  # (I,2) width, height in px
     K: Tensor  # (I,4) fx fy cx cy in px
     c2w: Tensor  # (I,3,4)
     near: Tensor  # (I,) smallest useful t
     points: Tensor  # (Q,3) SfM points
-    masked: Tensor  # (N,) whether a user's mask file excludes the pixel; (0,) without such files
+    masked: Tensor  # (.,) whether a user's mask file excludes the pixel; (0,) without such files
     thumbs: Tensor  # (I,3,2m,2m) uint8, whole photos for the mask network
     sfm_pixels: Tensor  # (I,m,m) mask pixels in which the photo saw an SfM point [D7]
     train: Tensor  # (.,) indices of the training photos
@@ -407,11 +418,22 @@ def pack_index(index, base=2**13):
 
 class Octree(nn.Module):
     """Feature grid over the cube [-half, half]^3 that is fine only where it has been split. Level
-    0 is a dense grid of root^3 cells. Features live on corners, shared by the cells that meet
-    there. A corner that lacks one of its eight cells ("hanging") has the weight 0, so a level's
-    features are continuous across borders of refined regions, and 0 on the cube's faces. Where a
-    level has no cell, its features are 0. A cell is a row of `cells`; `child` has the row of its
-    first child, `corner` those of its eight features; `corner_key` names the corner of each
+    0 is a dense grid of root^3 cells. A feature lives on a corner and is shared by the cells that
+    meet there. In the plane, three split cells of one level look like this in the next level:
+
+        o---o---o---o---o
+        |   |   |   |   |     *  has a feature: all cells around it exist
+        o---*---*---*---o     o  hanging: a cell around it is missing, so its weight is 0
+        |   |   |   |   |
+        o---*---o---o---o
+        |   |   |
+        o---*---o
+        |   |   |
+        o---o---o
+
+    So the features of a level fade to 0 at the border of what it refines, and are continuous. Where
+    a level has no cell, its features are 0. A cell is a row of `cells`; `child` has the row of its
+    first child, `corner` those of its eight features. `corner_key` names the corner of each
     feature, so that features survive a rebuild."""
     def __init__(self, half, levels, channels=4, root=ROOT):
         super().__init__()
@@ -430,11 +452,15 @@ class Octree(nn.Module):
         """(L,) side of a cell, scene units."""
         return 2 * self.half / self.resolution
 
-    def split(self, cells):
-        """Splits cells (...,4), but for those of the last level. The function stays, as new
-        features are zero. See build."""
-        cells = cells.reshape(-1, 4)
+    def split(self, cells, reach=0):
+        """Splits cells (N,4), and those of their neighbours that differ along at most `reach` axes:
+        1 means the six that share a face, 3 all 26. Cells of the last level are not split. Returns
+        what build does. The function stays as it is, because new features are zero."""
+        offsets = grid_index(3, cells.device) - 1  # (27,3)
+        offsets = offsets[offsets.abs().sum(1) <= reach]
+        cells = (cells[:, None] + F.pad(offsets, (1, 0))).flatten(0, 1)
         key = pack_index(cells[cells[:, 0] < self.levels - 1])
+        key = key[torch.isin(key, pack_index(self.cells))]  # a neighbour may not exist
         return self.build(torch.cat([self.split_keys, key]).unique())
 
     def build(self, split_keys):
@@ -455,7 +481,7 @@ class Octree(nn.Module):
         cells = torch.cat(cells)
         is_split = torch.cat(is_split)
         first_child = self.root**3 + 8 * (is_split.cumsum(0) - 1)  # (N,)
-        corners = pack_index(cells[:, None] + F.pad(octants, (1, 0)))  # (N,8) keys
+        corners = pack_index(cells)[:, None] + pack_index(F.pad(octants, (1, 0)))  # (N,8) keys
         key, corner, cells_around = corners.unique(return_inverse=True, return_counts=True)  # (.,)
         has_feature = cells_around == 8
         row = (has_feature.cumsum(0) - 1).clamp_min(0)  # of a corner's feature; any, where hanging
@@ -469,7 +495,7 @@ class Octree(nn.Module):
         self.child = nn.Buffer((first_child * is_split).int(), persistent=False)  # (N,) 0: none
         self.corner = nn.Buffer(row[corner].int(), persistent=False)  # (N,8) rows
         self.is_hanging = nn.Buffer(~has_feature[corner], persistent=False)  # (N,8)
-        # (N,3) sums over rays that hit a cell: of (1 - M) error, of pixel sizes there, their number
+        # (N,3) sums over rays that hit a cell: of errors, of pixel sizes there, their number
         self.cell_error = nn.Buffer(self.features.new_zeros(len(cells), 3))
         self.finest = 2 * self.half / (self.root * 2 ** cells[-1, 0].item())  # smallest cell's side
         return is_old
@@ -479,7 +505,7 @@ class Octree(nn.Module):
         x down to that level; whether the level has a cell there (P,L); the position in it, 0..1
         (P,L,3). An x outside the cube is moved to its border."""
         x = 0.5 + x * (0.5 / self.half)  # (P,3) over the cube
-        x = x.clamp(0, 1 - 1e-6).nan_to_num()  # check_finite ends a run that diverges
+        x = x.clamp(0, 1 - 1e-6).nan_to_num()  # a run that diverges ends in check_finite
         x = x[:, None] * self.resolution[:, None]  # (P,L,3) in cells
         index = x.long()  # (P,L,3)
         octants = pack_index(index & 1, base=2)  # (P,L)
@@ -525,11 +551,9 @@ def seed_octree(octree, points, dense):
     hanging. Features are then drawn at random. [D7]"""
     for _ in range(dense):
         octree.split(octree.cells)
-    neighbours = F.pad(grid_index(3, points.device) - 1, (1, 0))  # (27,4)
     for _ in range(2):
         node, _, _ = octree.locate(points)
-        home = octree.cells[node[:, -1].unique()]  # (N,4)
-        octree.split(home[:, None] + neighbours)
+        octree.split(octree.cells[node[:, -1].unique()], reach=3)
     nn.init.normal_(octree.features, std=0.01)
 
 
@@ -660,22 +684,35 @@ def lipschitz_loss(network):
     return sum(layer.c for layer in network[::2])
 
 
+def paper_lipschitz_loss(network):
+    """L_lps as in Liu et al. 2022: the network's bound. Permuto-SDF weights it by 3e-6."""
+    return lipschitz_loss(network).exp()
+
+
 # ---- 5 From SDF to colour: alpha, compositing, samples, background -------------------------------
 
 PROBES = 64  # even intervals of a ray at whose ends the cache is looked up, to place samples
-UNIFORM_SHARE = 0.25  # weight of evenly spread samples over that of others, so that a lost
-# surface can return
+UNIFORM_SHARE = 0.25  # ratio of uniform to importance weight, so that a lost surface can return
 
 
 def neus_alpha(sdf, zeta):
     """Opacity (R,S) of the intervals between samples with SDF (R,S+1). Eq. 1 corrected: alpha_i =
-    max(0, 1 - sigmoid(zeta s_{i+1}) / sigmoid(zeta s_i)), which is NeuS Eq. 13. In the paper's
-    form, without the division, the opacities of a crossing sum to 1, so that many samples let
-    exp(-1) of the light through: 63 % are absorbed. With s at both ends no slope beta is needed.
-    [D1]"""
+    max(0, 1 - sigmoid(zeta s_{i+1}) / sigmoid(zeta s_i)), which is NeuS Eq. 13. As s is taken at
+    both ends of an interval, no slope beta is needed. [D1]"""
     log_phi = F.logsigmoid(zeta * sdf)  # (R,S+1), which does not overflow
     fall = log_phi.diff().clamp_max(0)  # (R,S) 0 where the ray leads outwards
     return -fall.expm1()
+
+
+def paper_alpha(sdf, zeta):
+    """Eq. 1 as printed: sigmoid(zeta s_i + beta_i) - sigmoid(zeta s_{i+1} + beta_i), here not
+    negative. beta_i, half of the slope times the length of the interval, is half of the change of
+    s. Without NeuS's division the opacities of a crossing sum to 1 at most. Many samples then let
+    exp(-1) of the light through: 63 % are absorbed."""
+    beta = sdf.diff() / 2  # (R,S)
+    before = torch.sigmoid(zeta * sdf[:, :-1] + beta)
+    after = torch.sigmoid(zeta * sdf[:, 1:] + beta)
+    return (before - after).clamp_min(0)
 
 
 def composite(alpha):
@@ -688,9 +725,9 @@ def composite(alpha):
 
 
 def inverse_cdf(edges, weight, u):
-    """Positions (R,S) where the linear CDF of weight (R,N) on edges (R,N+1) reaches u (R,S)."""
+    """Positions (R,S) where the linear CDF of weight (R,K) on edges (R,K+1) reaches u (R,S)."""
     cdf = weight.cumsum(1)
-    cdf = F.pad(cdf / cdf[:, -1:], (1, 0))  # (R,N+1)
+    cdf = F.pad(cdf / cdf[:, -1:], (1, 0))  # (R,K+1)
     right = torch.searchsorted(cdf, u, right=True).clamp_max(weight.shape[1])  # (R,S) from 1
     left = right - 1
     below = cdf.gather(1, left)
@@ -700,83 +737,54 @@ def inverse_cdf(edges, weight, u):
 
 
 def stratified(jitter):
-    """Numbers (R,S) in 0..1, one in each of S equal strata, where jitter (R,S) in 0..1 says."""
+    """One number in each of S equal strata of 0..1: (k + jitter_k) / S, of jitter (R,S)."""
     _, S = jitter.shape
     return (torch.arange(S, device=jitter.device) + jitter) / S
 
 
+def importance_samples(probes, alpha, jitter):
+    """Distances (R,S+1) from the first to the last of the probes (R,K+1), dense where the intervals
+    between them, of opacity alpha (R,K), have weight. jitter: (R,S-1) in 0..1, of the stratified
+    samples between the two ends."""
+    weight = composite(alpha)
+    uniform_weight = UNIFORM_SHARE * weight.mean(1, keepdim=True)
+    weight = weight + uniform_weight + 1e-5  # an empty ray has uniform samples
+    inner = inverse_cdf(probes, weight, stratified(jitter))
+    return torch.cat([probes[:, :1], inner, probes[:, -1:]], 1)
+
+
 class SDFCache(nn.Module):
-    """s, E_grad and E_curv on a dense grid that is refreshed every CACHE_EVERY steps: coarsely
-    until ZETA_RISE, then in turns, and as a whole at the end. It guides where samples lie along a
-    ray [D8] and gives the complexity of the geometry along it (Eq. 4)."""
+    """s, E_grad and E_curv on a dense grid, renewed every CACHE_EVERY steps. It guides where samples
+    lie along a ray [D8] and gives the complexity of the geometry along it (Eq. 4)."""
     def __init__(self, n):
         super().__init__()
         self.n = n
         self.volume = nn.Buffer(torch.zeros(1, 3, n, n, n))  # x slowest
-        radius = self.points(torch.arange(n**3)).norm(dim=1)
-        inside = (radius < 1 + 6 / n).nonzero()[:, 0]  # (N,) voxels in the sphere or next to it
+        voxels = grid_index(n, self.volume.device) * (2 / (n - 1)) - 1  # (n^3,3)
+        inside = (voxels.norm(dim=1) < 1 + 6 / n).nonzero()[:, 0]  # in the sphere or next to it
         self.inside = nn.Buffer(inside, persistent=False)
+        self.points = nn.Buffer(voxels[inside], persistent=False)  # (P,3)
 
-    def points(self, index):
-        """Points (P,3) of voxels (P,)."""
-        n = self.n
-        voxel = torch.stack([index // n**2, index // n % n, index % n], 1)
-        return voxel * (2 / (n - 1)) - 1
-
-    def refresh(self, sdf, turn=None):
-        """Evaluates sdf, (P,3) to (P,), again. Without a turn, at all voxels in the sphere. With
-        one, at a quarter of them: the eighth nearest to the surface, and every eighth voxel,
-        beginning at turn % 8, so that eight turns renew all."""
+    def refresh(self, sdf):
+        """Evaluates sdf, (P,3) to (P,), again at all voxels in the sphere."""
         s = self.volume[0, 0].flatten()  # (n^3,)
-        chosen = [self.inside]
-        if turn is not None:
-            distance = s[self.inside].abs()
-            nearest = distance.topk(len(distance) // 8, largest=False, sorted=False).indices
-            chosen = [self.inside[nearest], self.inside[turn % 8::8]]
-        for index in chosen:
-            s[index] = in_chunks(sdf, self.points(index))
-        self.fill(s.view_as(self.volume[0, 0]))
-
-    def refresh_coarse(self, sdf):
-        """Evaluates sdf on a grid of half as many points along an axis, s being linear between
-        them: enough for a soft surface, and all of it is new. Creases count less in Phi."""
-        m = self.n // 2
-        points = grid_index(m, self.volume.device) * (2 / (m - 1)) - 1
-        s = in_chunks(sdf, points).view(1, 1, m, m, m)
-        s = F.interpolate(s, [self.n] * 3, mode="trilinear", align_corners=True)
-        self.fill(s[0, 0])
-
-    def fill(self, s):
-        """Holds s (n,n,n) and its errors from now on."""
+        s[self.inside] = in_chunks(sdf, self.points)
+        s = s.view_as(self.volume[0, 0])
         self.volume[0] = torch.stack([s, *central_differences(s)])
 
     def lookup(self, x, channels):
-        """Values (.,R,N) of some channels at x (R,N,3), trilinear."""
-        grid = x.flip(-1)[None, None]  # (1,1,R,N,3), z first as grid_sample wants it
+        """Values (.,R,K) of some channels at x (R,K,3), trilinear."""
+        grid = x.flip(-1)[None, None]  # (1,1,R,K,3), z first as grid_sample wants it
         volume = self.volume[:, channels]
         return F.grid_sample(volume, grid, padding_mode="border", align_corners=True)[0, :, 0]
 
     def sdf(self, x):
-        """s (R,N) at x (R,N,3)."""
+        """s (R,K) at x (R,K,3)."""
         return self.lookup(x, slice(0, 1))[0]
 
     def errors(self, x):
-        """E_grad and E_curv (R,) of rays with samples x (R,N,3): ray-wise averages. Eq. 4 [D8]"""
+        """E_grad and E_curv (R,) of rays with samples x (R,K,3): ray-wise averages. Eq. 4 [D8]"""
         return self.lookup(x, slice(1, 3)).mean(2)
-
-    @torch.no_grad()
-    def sample(self, rays, t0, t1, jitter, alpha_of):
-        """Distances (R,S+1) from t0 to t1 (R,1), dense where a surface is seen. jitter: (R,S-1) in
-        0..1, of the stratified samples between the ends; alpha_of: GeoNVS.alpha. N = PROBES"""
-        even = torch.linspace(0, 1, PROBES + 1, device=t0.device)
-        probes = t0.lerp(t1, even)  # (R,N+1)
-        sdf = self.sdf(rays.at(probes))  # (R,N+1)
-        alpha = alpha_of(sdf, probes, max_zeta=self.n)  # (R,N) surfaces at least half a voxel wide
-        weight = composite(alpha)
-        uniform_weight = UNIFORM_SHARE * weight.mean(1, keepdim=True)
-        weight = weight + uniform_weight + 1e-5  # an empty ray has uniform samples
-        inner = inverse_cdf(probes, weight, stratified(jitter))
-        return torch.cat([t0, inner, t1], 1)
 
 
 def central_differences(s):
@@ -799,119 +807,114 @@ def contract(x):
 
 
 class Background(nn.Module):
-    """A small NeRF in front of and beyond the sphere, on an octree over contracted space. [D6]"""
+    """A small NeRF beyond the sphere, on an octree over contracted space."""
     def __init__(self, points, hidden, extra, levels):
         super().__init__()
         self.octree = Octree(2.0, levels, root=32)  # cells of 1/8
-        seed_octree(self.octree, contract(points), dense=levels - 3)  # (N,3)
+        seed_octree(self.octree, contract(points), dense=levels - 3)  # points (P,3)
         self.density = mlp(3 + self.octree.width, hidden, 1 + GEOMETRY_FEATURES)
         self.color = mlp(GEOMETRY_FEATURES + extra, hidden, 3)
 
-    def forward(self, rays, t0, t1, per_ray, jitter):
-        """Renders what lies around the foreground. per_ray: (R,3+A) direction and code; jitter:
-        (R,S) in 0..1, where S counts background samples. The first n = S // 6 are evenly spaced
-        from near to t0 (R,1); the others lie u / (1 - u) behind t1 (R,1), with u even in 0..1. The
-        last one is opaque. Returns
-            near_color          (R,3)  of what lies before t0
-            near_transmittance  (R,1)  up to t0
-            far_color           (R,3)  of what lies behind t1, dimmed by what lies before t0
-            far_place           (R,3)  its mean position, in contracted space"""
-        _, S = jitter.shape
-        n = S // 6
-        number = torch.arange(S, device=t0.device) + jitter  # (R,S)
-        near = rays.near.lerp(t0, number[:, :n] / n)  # (R,n)
-        u = (number[:, n:] - n) / (S - n)  # (R,S-n)
-        far = u / (1 - u).clamp_min(1e-3)  # at most 1,000 radii away
-        near_length = torch.cat([near, t0], 1).diff()  # (R,n)
-        length = torch.cat([near_length, far.diff()], 1)  # (R,S-1)
-        t = torch.cat([near, t1 + far], 1)  # (R,S)
-        x = contract(rays.at(t))  # (R,S,3)
+    def forward(self, rays, t1, per_ray, jitter):
+        """Colour (R,3) beyond t1 (R,1), and the mean position (R,3) of what is seen there, in
+        contracted space, without gradient. per_ray: (R,3+A) direction and code. A sample, with
+        jitter (R,S) in 0..1, lies u / (1 - u) behind t1, where u is stratified. The last one is
+        opaque."""
+        u = stratified(jitter)
+        distance = u / (1 - u).clamp_min(1e-3)  # (R,S) at most 1,000 radii
+        x = contract(rays.at(t1 + distance))  # (R,S,3)
         inputs = torch.cat([x, self.octree(x)], 2)  # (R,S,3+LC)
         out = mixed_precision(self.density, inputs)  # (R,S,1+GEOMETRY_FEATURES)
         sigma, geo = out.split([1, GEOMETRY_FEATURES], 2)
-        rgb = colors_of(self.color, geo, per_ray)  # (R,S,3)
         sigma = F.softplus(sigma[..., 0] - 1)  # (R,S) starts at 0.31
-        alpha = 1 - torch.exp(-sigma[:, :-1] * length)  # (R,S-1)
+        alpha = 1 - torch.exp(-sigma[:, :-1] * distance.diff())  # (R,S-1)
         w = composite(F.pad(alpha, (0, 1), value=1.0))  # (R,S)
-        near_w, far_w = w.split([n, S - n], 1)
-        near_rgb, far_rgb = rgb.split([n, S - n], 1)
-        near_color = torch.einsum("rs,rsc->rc", near_w, near_rgb)
-        far_color = torch.einsum("rs,rsc->rc", far_w, far_rgb)
-        near_transmittance = 1 - near_w.sum(1, keepdim=True)
-        far_w = F.normalize(far_w.detach(), p=1, dim=1)
-        far_place = torch.einsum("rs,rsc->rc", far_w, x[:, n:])
-        return near_color, near_transmittance, far_color, far_place
+        rgb = colors_of(self.color, geo, per_ray)  # (R,S,3)
+        color = torch.einsum("rs,rsc->rc", w, rgb)
+        place = torch.einsum("rs,rsc->rc", F.normalize(w.detach(), p=1, dim=1), x)
+        return color, place
 
 
-def render_rays(model, rays, code, jitter, points):
-    """A batch of rays through the cache, the networks and the background of a model (section 7).
-        code     (R,A)    appearance
-        jitter   (R,.)    in 0..1, places samples: S - 1 of the foreground, then the background's
-        points   (N,3)    more points, off the rays, at which derivatives are taken
-    Returns a dictionary. depth, surface_point and place have no gradient.
-        rgb            (R,3)
-        opacity        (R,)      of the foreground, whatever lies in front of the sphere
-        is_solid       (R,)      whether it exceeds a half
-        depth          (R,)      where the foreground is hit, on average; t1 if it is not
-        surface_point  (R,3)     the point there
-        place          (R,3)     where the ray ends, in contracted space: there or on the background
-                                 beyond the sphere
-        normal         (R,3)     at the surface point, times opacity
-        e_grad         (R+N,)    E_grad at surface points, then at points
-        e_curv         (R,)      E_curv at surface points, times opacity
-        sdf            (N,)      at points
-        ray_e_grad, ray_e_curv  (R,)  averages along the ray"""
+class Hits(NamedTuple):
+    """What rays meet; every field is indexed by the ray. depth, point and place have no gradient."""
+    x: Tensor  # (R,S+1,3) samples in the sphere
+    geo: Tensor  # (R,S+1,G) inputs of the colour network there
+    w: Tensor  # (R,S+1) their weights
+    opacity: Tensor  # (R,) of the foreground
+    depth: Tensor  # (R,) distance to the surface; t1 if none is met
+    point: Tensor  # (R,3) the surface point
+    bg_color: Tensor  # (R,3) of what lies beyond the sphere
+    place: Tensor  # (R,3) where the ray ends, in contracted space: the surface point if the
+    # foreground is solid, else the mean position of the background
+
+
+def trace_rays(model, rays, code, jitter):
+    """Hits of a batch of rays. code: (R,A) appearance; jitter: (R,.) in 0..1, places samples: S - 1
+    of the foreground, then the background's."""
     fg_jitter, bg_jitter = jitter.tensor_split([model.cfg.samples - 1], 1)
     t0, t1 = sphere_interval(rays.o, rays.d, rays.near)  # (R,1)
-    t = model.cache.sample(rays, t0, t1, fg_jitter, model.alpha)  # (R,S+1)
+    t = model.sample(rays, t0, t1, fg_jitter)  # (R,S+1)
     x = rays.at(t)  # (R,S+1,3)
     sdf, geo = model.sdf(x)  # (R,S+1), (R,S+1,G)
-    w = composite(model.alpha(sdf, t))  # (R,S)
+    w = composite(model.alpha(sdf))  # (R,S)
     opacity = w.sum(1)  # (R,)
+    depth = surface_depth(t, sdf.detach(), w.detach())
+    point = rays.at(depth[:, None])[:, 0]  # (R,3)
     # an interval has the mean colour of its ends, so each of them gets half of its weight [D1]
     w = F.pad(w, (1, 1))  # (R,S+2)
-    w_sample = 0.5 * (w[:, :-1] + w[:, 1:])  # (R,S+1)
+    w = 0.5 * (w[:, :-1] + w[:, 1:])  # (R,S+1)
 
-    weight = w_sample.detach()
-    depth = ((weight * t).sum(1) + 1e-3 * t1[:, 0]) / (weight.sum(1) + 1e-3)  # (R,)
-    surface_point = rays.at(depth[:, None])[:, 0]  # (R,3)
-    R = len(depth)
-    taken_at = torch.cat([surface_point, points])  # (R+N,3), as one lookup is faster than two
-    s, grad, lap = model.sdf.derivatives(taken_at, model.eps)  # (R+N,), (R+N,3), (R+N,) [D8]
-    normal = F.normalize(grad[:R])
-
-    per_ray = torch.cat([rays.d, code], 1)  # (R,3+A)
-    rgb = colors_of(model.color, geo, torch.cat([normal, per_ray], 1))  # (R,S+1,3)
-    rgb = torch.einsum("rs,rsc->rc", w_sample, rgb)  # (R,3)
-    far_color = model.bg_color  # (3,)
-    far_place = 2 * rays.d  # (R,3) infinity
+    bg_color = model.bg_color.expand_as(rays.d)  # (R,3)
+    bg_place = 2 * rays.d  # (R,3) infinity
     if model.background:
-        near_color, near_transmittance, far_color, far_place = model.background(
-            rays, t0, t1, per_ray, bg_jitter)
-        rgb = near_color + near_transmittance * rgb
-    is_solid = opacity > 0.5
-    ray_e_grad, ray_e_curv = model.cache.errors(x)
-    return dict(
-        rgb=rgb + (1 - opacity[:, None]) * far_color,
-        opacity=opacity,
-        is_solid=is_solid,
-        depth=depth,
-        surface_point=surface_point,
-        place=torch.where(is_solid[:, None], surface_point, far_place),
-        normal=normal * opacity[:, None],  # 0 where nothing is
-        e_grad=eikonal(grad),
-        e_curv=lap[:R].abs() * model.eps * opacity.detach(),  # [D2]
-        sdf=s[R:],
-        ray_e_grad=ray_e_grad,
-        ray_e_curv=ray_e_curv)
+        per_ray = torch.cat([rays.d, code], 1)  # (R,3+A)
+        bg_color, bg_place = model.background(rays, t1, per_ray, bg_jitter)
+    place = torch.where(opacity[:, None] > 0.5, point, bg_place)
+    return Hits(x, geo, w, opacity, depth, point, bg_color, place)
+
+
+def surface_depth(t, sdf, w):
+    """Distance (R,) to the surface on rays with samples at t (R,S+1), SDF (R,S+1) and weights w
+    (R,S) of the intervals between them. Each interval votes, with its weight, for the place where
+    the line through s at its two ends is zero. Where nothing has weight, the last sample counts."""
+    start, end = sdf[:, :-1], sdf[:, 1:]
+    steps = start / (start - end).clamp_min(1e-6)  # (R,S) to the zero, in intervals
+    zero = torch.lerp(t[:, :-1], t[:, 1:], steps)
+    zero = zero.clamp(t[:, :1], t[:, -1:])
+    return ((w * zero).sum(1) + 1e-6 * t[:, -1]) / (w.sum(1) + 1e-6)
+
+
+def shade(model, rays, code, hits, normal):
+    """Colours (R,3) of rays with hits and normals (R,3) at their surface points. All samples of a
+    ray share its normal, which is no input in the paper. [D8]"""
+    per_ray = torch.cat([normal, rays.d, code], 1)  # (R,3+3+A)
+    rgb = colors_of(model.color, hits.geo, per_ray)  # (R,S+1,3)
+    rgb = torch.einsum("rs,rsc->rc", hits.w, rgb)  # (R,3)
+    return rgb + (1 - hits.opacity[:, None]) * hits.bg_color
+
+
+class Rendering(NamedTuple):
+    """A rendered batch of rays."""
+    rgb: Tensor  # (R,3)
+    opacity: Tensor  # (R,) of the foreground
+    depth: Tensor  # (R,)
+    normal: Tensor  # (R,3) at the surface point, times opacity: 0 where nothing is
+
+
+def render_rays(model, rays, code, jitter):
+    """A batch of rays through the cache, the networks and the background of a model (section 7).
+    Arguments as those of trace_rays."""
+    hits = trace_rays(model, rays, code, jitter)
+    _, grad, _ = model.sdf.derivatives(hits.point, model.eps)
+    normal = F.normalize(grad)
+    rgb = shade(model, rays, code, hits, normal)
+    return Rendering(rgb, hits.opacity, hits.depth, normal * hits.opacity[:, None])
 
 
 # ---- 6 Photos in the wild: transient mask and geometry preservation ------------------------------
 
 # of Eq. 4 (paper), which has lambda_curv in Eq. 5, too; there 2 would outweigh L_rgb [D2]
 LAMBDA_GRAD, LAMBDA_CURV = 10.0, 2.0
-MASK_TRAINING = 0.6  # share; then M is fixed, as errors of memorised people are small [D3]
-REJECTION = 0.3  # share of training in which outliers are rejected
 MIN_THRESHOLD = 0.15  # no smaller error makes a pixel transient
 PLACE_CELLS = 32  # along an axis, of the table of errors over contracted space
 PLACE_QUANTILE = 0.2  # of the errors at a place in all photos; low, so that people hardly raise it
@@ -924,15 +927,20 @@ def complexity(e_grad, e_curv):
     return LAMBDA_GRAD * e_grad + LAMBDA_CURV * e_curv
 
 
-def edge_indicator(ray_complexity, opacity, quantiles):
-    """Phi (R,), Eq. 4: a calibrated sigmoid of the complexity, times opacity. The sigmoid is 0.5 at
-    the upper quartile of the complexity of foreground rays; its width is a quarter of the range
-    from their median to their 95 % quantile. quantiles (3,): 50, 75, 95 %. Complexity is never
-    negative, so that a plain sigmoid is at least 0.5 on every ray and protects all alike; and a ray
-    through air has no edge, hence the opacity. [D2]"""
-    p50, p75, p95 = quantiles
-    width = ((p95 - p50) / 4).clamp_min(1e-3)
-    return opacity * torch.sigmoid((ray_complexity - p75) / width)
+def edge_indicator(ray_complexity, opacity):
+    """Phi (R,), Eq. 4: a calibrated sigmoid of the complexity, times opacity. The paper does not
+    say how it is calibrated. Here the complexity is standardised by its mean and deviation over the
+    step's rays, so that Phi tells rays apart at any scale. A ray through air has no edge, hence the
+    opacity. [D2]"""
+    above_mean = ray_complexity - ray_complexity.mean()
+    deviation = ray_complexity.std(correction=0).clamp_min(1e-3)
+    return opacity * torch.sigmoid(above_mean / deviation)
+
+
+def paper_phi(ray_complexity):
+    """Phi (R,), Eq. 4 with a plain sigmoid. The complexity is never negative, so Phi is at least
+    0.5 on every ray and protects all alike."""
+    return torch.sigmoid(ray_complexity)
 
 
 def gpl_loss(mask, phi):
@@ -944,11 +952,18 @@ def gpl_loss(mask, phi):
 def mask_loss(logit, excess):
     """L_reg: binary cross entropy that classifies rays (R,) by their error. A ray whose error
     exceeds its threshold (excess > 0) is trained towards M = 1, any other towards M = 0, weighted
-    by |excess|. The same M minimises (1 - M) error + M threshold, but the gradient of that vanishes
-    where the sigmoid saturates. Penalties for intensity and bimodality, as in CR-NeRF, made M all 0
-    or all 1. [D3]"""
+    by |excess|. The sum over rays is least where M minimises (1 - M) error + M threshold, but that
+    form's gradient vanishes where the sigmoid saturates. L_GPL adds 0.05 Phi M to it: it can raise
+    a threshold by 0.05 at most. [D3]"""
     is_transient = (excess > 0).float()
     return F.binary_cross_entropy_with_logits(logit, is_transient, excess.abs())
+
+
+def paper_mask_loss(mask, error):
+    """L_reg as the paper describes it: the error that M takes out of L_rgb, with penalties for
+    intensity and bimodality. Their form and weights are not printed; these are CR-NeRF's forms. M
+    minimises 0.15 M^2 - M error: it is error / 0.3, and with L_GPL (error - 0.05 Phi) / 0.3."""
+    return (0.15 * mask**2 + 0.02 * mask * (1 - mask) - mask * error).mean()
 
 
 def reject_outliers(mask, is_outlier, done):
@@ -959,23 +974,34 @@ def reject_outliers(mask, is_outlier, done):
     return torch.where(is_outlier & (mask > bar), 1.0, mask)
 
 
-def update_running_quantiles(running, level, group, values, is_chosen):
-    """Moves running quantiles of positive numbers, in place. running (N,): one a group; level:
-    which quantile, a float or (P,); group (P,): index into running; values (P,), of which those
-    count that are chosen (P,). A value above pushes its quantile up by level, one below down by
-    1 - level, so that both balance at the quantile (the gradient of the pinball loss)."""
-    is_below = values < running[group]  # (P,)
-    push = (level - is_below.float()) * is_chosen
-    total = torch.zeros_like(running).index_add_(0, group, push)
-    count = torch.zeros_like(running).index_add_(0, group, is_chosen.float())
-    running *= torch.exp(QUANTILE_RATE * total / count.clamp_min(1))
-    running.clamp_min_(1e-6)  # as no factor leads away from 0
+class UsualErrors(nn.Module):
+    """For each place of contracted space a low quantile of the errors of all rays that end there.
+    A place that is bad in all photos is the model's fault. One that is bad in one photo shows a
+    tourist. [D3]"""
+    def __init__(self):
+        super().__init__()
+        self.quantile = nn.Buffer(torch.full((PLACE_CELLS**3,), 0.1))  # a first guess
 
+    def cell(self, place):
+        """Index (R,) into the table of places (R,3)."""
+        index = ((place * 0.25 + 0.5) * PLACE_CELLS).long()
+        return pack_index(index.clamp(0, PLACE_CELLS - 1), base=PLACE_CELLS)
 
-def place_cell(place):
-    """Index (R,) into a table over contracted space, of places (R,3) in it."""
-    index = (place * 0.25 + 0.5) * PLACE_CELLS
-    return pack_index(index.long().clamp(0, PLACE_CELLS - 1), base=PLACE_CELLS)
+    def threshold(self, place):
+        """The error (R,) above which rays that end at places (R,3) are transient."""
+        return (PLACE_FACTOR * self.quantile[self.cell(place)]).clamp_min(MIN_THRESHOLD)
+
+    def update(self, place, error, is_chosen):
+        """Moves the quantiles of places (R,3), given errors (R,), of which those count that are
+        chosen (R,). An error above a quantile pushes it up by its level, one below pushes it down
+        by 1 - level, so that both balance at the quantile (the gradient of the pinball loss)."""
+        cell = self.cell(place)
+        is_below = error < self.quantile[cell]
+        push = torch.where(is_below, PLACE_QUANTILE - 1, PLACE_QUANTILE) * is_chosen
+        mean = torch.zeros_like(self.quantile)
+        mean.scatter_reduce_(0, cell, push, "mean", include_self=False)
+        self.quantile *= torch.exp(QUANTILE_RATE * mean)
+        self.quantile.clamp_min_(1e-6)  # as no factor leads away from 0
 
 
 def conv(inputs, outputs, stride):
@@ -1012,10 +1038,9 @@ def sample_logits(logits, uv):
 
 
 class TransientMask(nn.Module):
-    """CGNet (as in CR-NeRF), which gives M, and the running quantiles that its threshold and Phi
-    depend on. The head reads all three resolutions: at 1/8 alone a mask could not follow an
-    outline. [D5]"""
-    def __init__(self, scene):
+    """CGNet (as in CR-NeRF), which gives M. The head reads all three resolutions: at 1/8 alone a
+    mask could not follow an outline. [D5]"""
+    def __init__(self, thumbs):
         super().__init__()
         self.stages = nn.Sequential(
             nn.Sequential(conv(3, 16, stride=2), conv(16, 16, stride=1)),
@@ -1024,11 +1049,7 @@ class TransientMask(nn.Module):
         # one bias, as logits are summed
         self.heads = nn.ModuleList(nn.Conv2d(n, 1, 1, bias=n == 16) for n in (16, 32, 64))
         nn.init.constant_(self.heads[0].bias, -2.5)  # starts with 8 % masked, not with half
-        self.thumbs = nn.Buffer(scene.thumbs, persistent=False)
-        self.quantile_levels = nn.Buffer(torch.tensor([0.5, 0.75, 0.95]), persistent=False)
-        # first guesses
-        self.complexity_quantiles = nn.Buffer(torch.tensor([0.5, 1.0, 4.0]))  # (3,)
-        self.place_error = nn.Buffer(torch.full((PLACE_CELLS**3,), 0.1))  # lower quantile
+        self.thumbs = nn.Buffer(thumbs, persistent=False)  # (I,3,2m,2m)
 
     def logits(self, photos):
         """Transient logits (B,1,m,m) of photos (B,)."""
@@ -1040,35 +1061,13 @@ class TransientMask(nn.Module):
             logits += F.interpolate(head(y), size, mode="bilinear")
         return logits
 
-    def threshold(self, place):
-        """The error (R,) above which rays are transient: unusual for the place (R,3) where the ray
-        ends. A place that is bad in all photos is the model's fault; one that is bad in one photo
-        shows a tourist. [D3]"""
-        usual = PLACE_FACTOR * self.place_error[place_cell(place)]  # (R,)
-        return usual.clamp_min(MIN_THRESHOLD)
-
-    def update_quantiles(self, rays, out, error):
-        """Follows the quantiles of complexity and error (R,) of a step's rays."""
-        R = len(error)
-        of_three = torch.arange(3, device=error.device).repeat_interleave(R)  # (3R,)
-        update_running_quantiles(
-            self.complexity_quantiles,
-            self.quantile_levels[of_three],
-            of_three,
-            out["complexity"].repeat(3),
-            out["is_solid"].repeat(3))
-        cell = place_cell(out["place"])
-        update_running_quantiles(self.place_error, PLACE_QUANTILE, cell, error, ~rays.is_masked)
-
 
 # ---- 7 The model and its objective ---------------------------------------------------------------
 
 START_ZETA = 20
 ZETA_FLOOR = 15, 80  # lower bound of zeta at first, and from ZETA_RISE of training on [D9]
-ZETA_RISE = 0.43  # until then surfaces are soft, and the cache is coarse
-MAX_PULL = 40  # zeta up to which SfM points pull harder
-NEAR_SFM = 0.1  # half the side of the cubes around SfM points in which L_eik is taken, too
-CACHE_EVERY = 64  # steps between renewals of the cache
+MAX_PULL = 40  # zeta up to which L_sfm and L_off grow stronger
+CACHE_EVERY = 128  # steps between renewals of the cache
 
 
 class Parts(NamedTuple):
@@ -1115,12 +1114,12 @@ class GeoNVS(nn.Module):
     def __init__(self, cfg, scene):
         super().__init__()
         self.cfg = replace(cfg)
-        self.has_mask = cfg.mask != "off"  # until decide_mask
         self.scene = scene
+        self.has_mask = cfg.mask == "on"
         self.jitter_per_ray = cfg.samples - 1 + cfg.bg_samples  # they place a ray's samples
         levels, A, has_background = needed_parts(cfg, scene.raw)
         is_inside = scene.points.norm(dim=1) < 1
-        self.sfm = nn.Buffer(scene.points[is_inside], persistent=False)  # (N,3), never empty
+        self.sfm = nn.Buffer(scene.points[is_inside], persistent=False)  # (Q,3), never empty
         self.air = nn.Buffer(air_segments(scene), persistent=False)  # (T,2,3), never empty
 
         octree = Octree(1.0, levels)
@@ -1141,12 +1140,12 @@ class GeoNVS(nn.Module):
         bg_color = torch.tensor(scene.raw["bg_color"].tolist()).nan_to_num(0.5)
         self.bg_color = nn.Buffer(bg_color, persistent=False)
         if has_background:
-            outside = scene.points[~is_inside]
             bg_levels = min(levels, 4)  # at most 256 cells across
-            self.background = Background(outside, cfg.hidden, 3 + A, bg_levels)
+            self.background = Background(scene.points[~is_inside], cfg.hidden, 3 + A, bg_levels)
             self.octrees.append(self.background.octree)
         self.deviation = nn.Parameter(torch.tensor(math.log(START_ZETA) / 10))
-        self.mask = TransientMask(scene)
+        self.mask = TransientMask(scene.thumbs)
+        self.usual_errors = UsualErrors()
         self.cache = SDFCache(64 if levels < 4 else 128)  # as fine as the octree, within bounds
         self.cache.refresh(self.distance)
         print(f"  octree levels: {levels}, appearance code: {A}, octrees: {len(self.octrees)}")
@@ -1161,71 +1160,103 @@ class GeoNVS(nn.Module):
         is the width of a surface."""
         return torch.exp(10 * self.deviation)
 
-    def alpha(self, sdf, t, max_zeta=math.inf):
-        """Opacity (R,S) of the intervals between samples at t (R,S+1) with SDF (R,S+1). t is there
-        for fields that need lengths, as the density in test_geonvs.py does."""
-        return neus_alpha(sdf, self.zeta().clamp_max(max_zeta))
+    def alpha(self, sdf, max_zeta=math.inf):
+        """Opacity (R,S) of the intervals between samples with SDF (R,S+1). Eq. 1"""
+        form = paper_alpha if self.cfg.printed("alpha") else neus_alpha
+        return form(sdf, self.zeta().clamp_max(max_zeta))
 
     def distance(self, x):
         """s (P,) at x (P,3)."""
         return self.sdf(x)[0]
 
+    @torch.no_grad()
+    def sample(self, rays, t0, t1, jitter):
+        """Distances (R,S+1) of the samples between t0 and t1 (R,1), dense where the cache sees a
+        surface, which is taken to be at least half a voxel wide. jitter: (R,S-1)"""
+        even = torch.linspace(0, 1, PROBES + 1, device=t0.device)
+        probes = t0.lerp(t1, even)  # (R,PROBES+1)
+        alpha = self.alpha(self.cache.sdf(rays.at(probes)), max_zeta=self.cache.n)
+        return importance_samples(probes, alpha, jitter)
+
     def losses(self, rays, photos, done, gen):
         """The objective of rays that come photo by photo, equally many of each of photos (B,);
-        done: share of training, 0..1. Returns the total; a dictionary for the log, its losses with
-        mse and the share left out; the dictionary of render_rays with error, left_out and
-        complexity (R,), which update_statistics needs."""
+        done: share of training, 0..1. Returns the total, and a dictionary for the log. Remembers
+        what refinement and the mask's threshold depend on."""
         cfg = self.cfg
         R = len(rays.o)
         code = self.appearance(photos).repeat_interleave(R // len(photos), 0)  # (R,A)
-        jitter = uniform(gen, R, self.jitter_per_ray)
-        sfm = self.sfm[random_index(gen, len(self.sfm), math.ceil(R / 4))]  # (N,3)
-        near_sfm = sfm + NEAR_SFM * (2 * uniform(gen, *sfm.shape) - 1)  # (N,3)
-        points = torch.cat([sfm, near_sfm])  # (2N,3): L_sfm is of the first N, L_eik of all
-        out = render_rays(self, rays, code, jitter, points)
-        residual = (out["rgb"] - rays.rgb).abs()  # (R,3)
-        error = residual.detach().amax(1)  # (R,) of the worst channel
-        left_out, reg, gpl, ray_complexity = self.transients(rays, photos, out, error, done)
+        hits = trace_rays(self, rays, code, uniform(gen, R, self.jitter_per_ray))
+        n = math.ceil(R / 4)
+        sfm = self.sfm[random_index(gen, len(self.sfm), n)]  # (n,3)
+        start, end = self.air[random_index(gen, len(self.air), n)].unbind(1)  # (n,3)
+        air = start.lerp(end, uniform(gen, n, 1))  # (n,3)
+        # one lookup is faster than three [D8]
+        points = torch.cat([hits.point, sfm, air])  # (R+2n,3)
+        s, grad, lap = self.sdf.derivatives(points, self.eps)  # (R+2n,), (R+2n,3), (R+2n,)
+        opacity = hits.opacity.detach()
+        is_surface = F.pad(opacity, (0, 2 * n), value=1.0)  # (R+2n,) a ray through air has none
 
+        rgb = shade(self, rays, code, hits, F.normalize(grad[:R]))  # (R,3)
+        residual = (rgb - rays.rgb).abs()  # (R,3)
+        error = residual.detach().amax(1)  # (R,) of the worst channel
+        left_out, reg, gpl, phi = self.transients(rays, photos, hits, error, done)
         pull = self.zeta().detach().clamp_max(MAX_PULL)  # at first s must be free to change [D7]
-        start, end = self.air[random_index(gen, len(self.air), len(sfm))].unbind(1)  # (N,3)
-        air = start.lerp(end, uniform(gen, len(sfm), 1))  # (N,3)
+        _, s_sfm, s_air = s.split([R, n, n])
         loss = dict(
             rgb=((1 - left_out) * residual.mean(1)).mean(),  # [D3]
-            eik=out["e_grad"].mean(),  # at surface points, at SfM points and near them [D8]
-            curv=out["e_curv"].mean(),
+            eik=(is_surface * eikonal(grad)).mean(),
+            curv=(opacity * lap[:R].abs()).mean() * self.eps,  # [D2]
             reg=reg,
             gpl=gpl,
-            lps=lipschitz_loss(self.color),
-            off=pull * off_surface_loss(self.distance(air), self.sdf.octree.finest),  # [D7]
-            sfm=pull * out["sdf"][:len(sfm)].abs().mean())  # [D7]
-        total = objective(loss, cfg)
+            lps=(paper_lipschitz_loss if cfg.printed("lps") else lipschitz_loss)(self.color),
+            off=pull * off_surface_loss(s_air, self.sdf.octree.finest),  # [D7]
+            sfm=pull * s_sfm.abs().mean())  # [D7]
+        self.remember(rays, hits, error)
         log = loss | dict(
             mse=residual.square().mean(),
-            left_out=left_out.mean())
-        out |= dict(error=error, left_out=left_out, complexity=ray_complexity)
-        return total, log, out
+            left_out=left_out.mean(),
+            phi_mean=phi.mean(),
+            phi_spread=phi.std(correction=0))
+        return objective(loss, cfg), log
 
-    def transients(self, rays, photos, out, error, done):
-        """Section 6 for rays with out of render_rays and errors (R,). Returns what L_rgb leaves out
-        (R,): M, or 1 for rejected outliers and for pixels that a user's mask excludes; L_reg;
-        L_GPL; the complexity (R,) along the rays."""
-        ray_complexity = complexity(out["ray_e_grad"], out["ray_e_curv"])  # (R,)
-        opacity = out["opacity"].detach()
-        phi = edge_indicator(ray_complexity, opacity, self.mask.complexity_quantiles)  # (R,)
-        reg = error.new_zeros(())
-        gpl = error.new_zeros(())
+    def transients(self, rays, photos, hits, error, done):
+        """Section 6 for rays with hits and errors (R,). Returns what L_rgb leaves out (R,): M, or 1
+        for rejected outliers and for pixels that a user's mask excludes; L_reg; L_GPL; Phi (R,)."""
+        e_grad, e_curv = self.cache.errors(hits.x)  # (R,)
+        if self.cfg.printed("phi"):
+            phi = paper_phi(complexity(e_grad, e_curv))
+        else:
+            phi = edge_indicator(complexity(e_grad, e_curv), hits.opacity.detach())
         left_out = torch.zeros_like(error)
+        reg = gpl = error.new_zeros(())
         if self.has_mask:
             with torch.set_grad_enabled(done < MASK_TRAINING):
                 logit = sample_logits(self.mask.logits(photos), rays.uv)  # (R,)
             M = logit.sigmoid()
+            is_counted = ~rays.is_masked
             # SfM pixels count as if they had no error: they train M = 0 [D7]
-            excess = error.masked_fill(rays.has_sfm, 0) - self.mask.threshold(out["place"])
-            reg = mask_loss(logit, excess * ~rays.is_masked)
-            gpl = gpl_loss(M, phi * ~rays.is_masked)
-            left_out = reject_outliers(M.detach(), excess > 0, done)
-        return left_out.masked_fill(rays.is_masked, 1), reg, gpl, ray_complexity
+            error = error.masked_fill(rays.has_sfm, 0)
+            if self.cfg.printed("reg"):
+                reg = paper_mask_loss(M * is_counted, error)
+                left_out = M.detach()
+            else:
+                excess = error - self.usual_errors.threshold(hits.place)
+                reg = mask_loss(logit, excess * is_counted)
+                left_out = reject_outliers(M.detach(), excess > 0, done)
+            gpl = gpl_loss(M, phi * is_counted)
+        return left_out.masked_fill(rays.is_masked, 1), reg, gpl, phi
+
+    def remember(self, rays, hits, error):
+        """Follows the errors (R,) of a step's rays: for the mask's threshold those of a place, for
+        refinement those of the octree's cells at surface points. [D3] [D10]"""
+        self.usual_errors.update(hits.place, error, ~rays.is_masked)
+        is_solid = hits.opacity > 0.5  # (R,)
+        pixel = hits.depth / self.scene.K[rays.img, 0]  # (R,) its size at the surface point
+        counted = error.masked_fill(rays.is_masked, 0)
+        columns = torch.stack([counted, pixel, torch.ones_like(pixel)], 1) * is_solid[:, None]
+        octree = self.sdf.octree
+        node, _, _ = octree.locate(hits.point)
+        octree.cell_error.index_add_(0, node[:, -1], columns)
 
     def before_step(self, step, done):
         """Keeps zeta within bounds and renews the cache. The floor of zeta rises with training
@@ -1233,29 +1264,17 @@ class GeoNVS(nn.Module):
         errors and are not masked, and then surfaces stay soft. The upper bound is a width 1 / zeta
         of 1/64 of an even interval, 2 / S; thinner surfaces get no gradient. [D9]"""
         start, end = ZETA_FLOOR
-        floor = start + (end - start) * min(done / ZETA_RISE, 1.0)
+        lower = start + (end - start) * min(done / ZETA_RISE, 1.0)
         upper = 32 * self.cfg.samples
-        self.deviation.data.clamp_(math.log(floor) / 10, math.log(upper) / 10)
+        if self.cfg.printed("zeta"):
+            lower, upper = 1e-6, 1e6  # no overflow
+        self.deviation.data.clamp_(math.log(lower) / 10, math.log(upper) / 10)
         if step % CACHE_EVERY == 0:
-            if done < ZETA_RISE:
-                self.cache.refresh_coarse(self.distance)
-            else:
-                self.cache.refresh(self.distance, step // CACHE_EVERY)
+            self.cache.refresh(self.distance)
 
     def after_training(self):
         """Pictures follow the last weights."""
         self.cache.refresh(self.distance)
-
-    def update_statistics(self, rays, out):
-        """Remembers what refinement, the mask's threshold and Phi depend on."""
-        self.mask.update_quantiles(rays, out, out["error"])
-        is_solid = out["is_solid"]  # (R,)
-        pixel = out["depth"] / self.scene.K[rays.img, 0]  # (R,) its size at the surface point
-        error = (1 - out["left_out"]) * out["error"]
-        columns = torch.stack([error * is_solid, pixel * is_solid, is_solid], 1)  # (R,3)
-        octree = self.sdf.octree
-        node, _, _ = octree.locate(out["surface_point"])
-        octree.cell_error.index_add_(0, node[:, -1], columns)
 
     def batch(self, n, gen):
         """n random rays and the photos (B,) they come from, photo by photo."""
@@ -1293,16 +1312,6 @@ class GeoNVS(nn.Module):
             if group["name"] == "grids":
                 group["params"] = [tree.features for tree in self.octrees]
 
-    @torch.no_grad()
-    def decide_mask(self, processes=ALONE):
-        """--mask auto: off if M marks hardly anything in the first 64 training photos; pixels that
-        a user's mask excludes count, too. [D10]"""
-        if self.cfg.mask == "auto":
-            photos = self.scene.train[:64]
-            share = self.mask.logits(photos).sigmoid().mean().item()
-            self.has_mask = processes.share(share > 0.01)
-            print(f"  mean mask {share:.4f}: mask {'on' if self.has_mask else 'off'}")
-
     def codes(self):
         """Appearance codes (I,A) of all photos."""
         return self.appearance.weight.detach()
@@ -1310,7 +1319,7 @@ class GeoNVS(nn.Module):
     def render(self, rays, code):
         """render_rays with samples in the middle of their strata: for pictures, to fit codes."""
         middle = code.new_full((len(code), self.jitter_per_ray), 0.5)
-        return render_rays(self, rays, code, middle, rays.o[:0])
+        return render_rays(self, rays, code, middle)
 
 
 # ---- 8 Energy ------------------------------------------------------------------------------------
@@ -1337,7 +1346,6 @@ def metered_joules(device, joules, processes=ALONE):
 
 # ---- 9 Training ----------------------------------------------------------------------------------
 
-REFINE_AT = (0.1, 0.2, 0.3, 0.45, 0.6)  # shares of training at which the octree is refined
 LOG_EVERY = 30  # seconds between lines of the log; a checkpoint is made with each
 RESULTS = ("metrics.json", "codes.npy", "panel.png", "mesh.ply", "film.mp4")  # and held_out/
 
@@ -1368,7 +1376,7 @@ def training_step(model, optimizer, step, done, gen, processes=ALONE):
     device."""
     model.before_step(step, done)
     rays, picked = model.batch(model.cfg.rays, gen)
-    loss, terms, out = model.losses(rays, picked, done, gen)
+    loss, terms = model.losses(rays, picked, done, gen)
     optimizer.zero_grad()
     loss.backward()
     processes.average_gradients(model)
@@ -1377,7 +1385,6 @@ def training_step(model, optimizer, step, done, gen, processes=ALONE):
     for group in optimizer.param_groups:
         group["lr"] = warm_up * decay * group["base_lr"]
     optimizer.step()
-    model.update_statistics(rays, out)
     return terms | dict(total=loss.detach())
 
 
@@ -1479,8 +1486,6 @@ def load_run(run, **given):
     with device:
         model = GeoNVS(cfg, scene)
     _, state = restore(saved, model)
-    if state.share_done(cfg) >= MASK_TRAINING:
-        model.decide_mask()
     model.after_training()  # a run that was stopped has an older cache
     codes = model.codes()
     if (run / "codes.npy").exists():  # finished: codes of test photos are fitted
@@ -1528,8 +1533,6 @@ def train(cfg, scene, run, saved=None, processes=ALONE):
         if not processes.is_first:
             model.sdf.octree.cell_error.zero_()  # what the first one has is of all
     done = state.share_done(cfg)
-    if done >= MASK_TRAINING:  # again, as --steps and --mask may have been given anew
-        model.decide_mask(processes)
     if done >= 1:
         model.after_training()
         return model, state
@@ -1565,8 +1568,6 @@ def train(cfg, scene, run, saved=None, processes=ALONE):
                 if processes.is_first:
                     state.joules = next(meter, None)  # None, never 0, once a counter has failed
                     save(run, model, optimizer, gen, state, terms, done)
-            if before < MASK_TRAINING <= done:  # it prints, so the checkpoint comes first
-                model.decide_mask(processes)
     if caught or is_stopped:
         raise KeyboardInterrupt(
             f"stopped; step {state.step} is saved, and the same command with --resume goes on")
@@ -1602,7 +1603,7 @@ def fit_codes(model, scene, photos, steps=128, n=64):
     for step in progress(range(steps), "fitting codes of held-out photos"):
         adam.param_groups[0]["lr"] = 0.1 * 0.1 ** (step / steps)
         rays = random_rays(scene, img, gen, part=0.5)
-        rgb = model.render(rays, codes.repeat_interleave(n, 0))["rgb"]
+        rgb = model.render(rays, codes.repeat_interleave(n, 0)).rgb
         residual = (rgb - rays.rgb).abs() * ~rays.is_masked[:, None]  # (Bn,3)
         adam.zero_grad()
         residual.mean().backward(inputs=codes)  # the model's weights get no gradient
@@ -1626,7 +1627,7 @@ def render_photo(model, scene, photo, code):
     for part in zip(*[column.split(RENDER_RAYS[code.device.type]) for column in columns]):
         rays = Rays(*part)
         out = model.render(rays, code.expand(len(rays.o), -1))
-        parts.append(torch.cat([out["rgb"], rays.rgb, out["normal"], out["depth"][:, None]], 1))
+        parts.append(torch.cat([out.rgb, rays.rgb, out.normal, out.depth[:, None]], 1))
     picture = torch.cat(parts).reshape(h, w, 10).cpu().numpy()
     rgb, truth, normal, depth = np.split(picture, [3, 6, 9], axis=2)
     return rgb, truth, normal, depth[..., 0]
