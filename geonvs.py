@@ -568,7 +568,9 @@ def cells_to_split(octree):
     found, worst = (error * can_split).sort(descending=True)  # (N,)
     error_before = found.cumsum(0) - found  # (N,) in worse cells
     is_chosen = error_before < SPLIT_SHARE * found.sum()
-    room = (MAX_CELLS - len(level)) // 8  # never negative: seeding makes far fewer
+    room = max(MAX_CELLS - len(level), 0) // (7 * 8)  # six neighbours are split with each
+    if is_chosen.sum() > room:
+        print(f"  the octree is full: {len(level)} cells of {MAX_CELLS}, so it is refined less")
     return octree.cells[worst[is_chosen][:room]]
 
 
@@ -1298,13 +1300,15 @@ class GeoNVS(nn.Module):
             dict(name="mask", params=mask, base_lr=cfg.lr_mask)]
 
     def refine(self, optimizer, processes=ALONE):
-        """Splits cells where colours err; Adam's moments move along with their features. [D10]"""
+        """Splits cells where colours err, and the neighbours that share a face with them, as the
+        outer corners of a single layer of cells would hang. Adam's moments move along with their
+        features. [D10]"""
         octree = self.sdf.octree
         processes.sum(octree.cell_error)
         # sums of floats differ between GPUs: one process chooses the cells for all
         worst = processes.share(cells_to_split(octree).cpu())
         state = optimizer.state.pop(octree.features)
-        is_old = octree.split(worst.to(octree.features.device))
+        is_old = octree.split(worst.to(octree.features.device), reach=1)
         for name in ("exp_avg", "exp_avg_sq"):
             state[name] = carry_over_rows(state[name], is_old)
         optimizer.state[octree.features] = state

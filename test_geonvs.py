@@ -1657,7 +1657,7 @@ def test_seeding_leaves_no_hanging_corner_around_points():
     assert 0.005 < octree.features.std() < 0.02
 
 
-def test_the_worst_cells_are_split(monkeypatch):
+def test_the_worst_cells_are_split(monkeypatch, capsys):
     octree = make_tree()
     octree.cell_error.uniform_()
     octree.cell_error[:, 1] /= 4  # pixels of about the sizes of cells
@@ -1669,8 +1669,31 @@ def test_the_worst_cells_are_split(monkeypatch):
     share = error[is_open][worst].cumsum(0) / error[is_open].sum()
     wanted = octree.cells[is_open][worst][:(share < 0.8).sum() + 1]
     assert torch.equal(geonvs.cells_to_split(octree), wanted)
-    monkeypatch.setattr(geonvs, "MAX_CELLS", len(octree.cells) + 47)  # five splits
+    monkeypatch.setattr(geonvs, "MAX_CELLS", len(octree.cells) + 5 * 56 + 55)
     assert torch.equal(geonvs.cells_to_split(octree), wanted[:5])
+    assert "the octree is full" in capsys.readouterr().out
+
+
+def test_refined_levels_are_alive_at_a_surface():
+    """After two refinements of a sphere hardly a feature weighs less for a corner that hangs."""
+    octree = geonvs.Octree(1.0, 5, root=8)
+    x = 0.6 * F.normalize(random(40000, 3, low=-1))
+    for _ in range(4):
+        node, _, _ = octree.locate(x)
+        octree.split(octree.cells[node[:, -1].unique()], reach=1)
+    node, exists, local = octree.locate(x)
+    weight = geonvs.trilinear_weights(local.flatten(0, 1)).view(-1, 5, 8)
+    alive = (weight * ~octree.is_hanging[node]).sum(2)  # (P,L)
+    assert exists.all()
+    assert (alive.mean(0)[1:] > 0.98).all()
+
+
+def test_splitting_ignores_neighbours_that_do_not_exist():
+    octree = make_tree()
+    cells = octree.cells.clone()
+    octree.split(torch.tensor([[0, 0, 0, 0], [0, 2, 2, 2], [2, 11, 0, 5]]), reach=3)
+    assert torch.isin(octree.split_keys, geonvs.pack_index(octree.cells)).all()
+    assert len(octree.cells) > len(cells)
 
 
 # ---- 4 fields ------------------------------------------------------------------------------------
@@ -2216,7 +2239,8 @@ def test_refining_moves_features_and_moments_with_corners(warm):
         table[:, 1] = torch.arange(1, len(table) + 1)
     octree.cell_error[:, ::2] = 1  # colours err everywhere
     worst = geonvs.cells_to_split(octree)
-    keys = torch.cat([octree.split_keys, geonvs.pack_index(worst)])
+    twin = copy.deepcopy(octree)
+    twin.split(worst, reach=1)
     warm.refine(optimizer)
     state = optimizer.state[octree.features]
     wanted = [number.get(key, 0) for key in octree.corner_key.tolist()]
@@ -2224,7 +2248,7 @@ def test_refining_moves_features_and_moments_with_corners(warm):
     for table in (octree.features, state["exp_avg"], state["exp_avg_sq"]):
         assert_tensors_close(table[:, 1], wanted)
     assert state["step"] == 1
-    assert torch.equal(octree.split_keys, keys.unique())
+    assert torch.equal(octree.split_keys, twin.split_keys)
     held = {p for group in optimizer.param_groups for p in group["params"]}
     assert held == set(warm.parameters())
 
