@@ -11,14 +11,15 @@ follow one ray from its pixel to the loss; the training loop comes after them.
     torchrun --nproc_per_node 4 geonvs.py  on 4 GPUs, each with rays of its own
     python geonvs.py --help                every setting with its meaning and default
 
-The paper's equations
-  Eq. 1  opacity of an interval     neus_alpha
+The paper's equations, and the forms as printed that `--paper` trains with
+  Eq. 1  opacity of an interval     neus_alpha                                 paper_alpha
   Eq. 2  compositing weights        composite
   Eq. 3  geometry preservation      gpl_loss
-  Eq. 4  edge indicator Phi         edge_indicator, complexity, SDFCache.errors, central_differences
-  Eq. 5  objective                  objective
-         L_rgb, L_eik, L_curv       GeoNVS.losses, of rgb, e_grad, e_curv from render_rays
-         L_reg, L_lps               mask_loss, lipschitz_loss
+  Eq. 4  edge indicator Phi         edge_indicator, complexity, SDFCache       paper_phi
+  Eq. 5  objective                  objective, of GeoNVS.losses
+         L_rgb, L_eik, L_curv       GeoNVS.losses; eikonal, finite_differences
+         L_reg                      mask_loss                                  paper_mask_loss
+         L_lps                      lipschitz_loss
          off-surface penalty        off_surface_loss, of air_segments
 
 Conventions
@@ -29,30 +30,35 @@ Conventions
   mask      M = 1 means transient (person, car), M = 0 means static scene
   symbols   s signed distance; zeta sharpness of the surface (1 / zeta is its width); eps step of
             finite differences; lap Laplacian; E_grad = (|grad s| - 1)^2; E_curv = |lap s| step [D2]
-  shapes    R rays, S intervals of a ray (S + 1 samples), P points, N as the line says, L octree
-            levels, C channels per level, V feature rows, G inputs of the colour network from
-            geometry, A appearance dims, I photos in all, B of them in a batch, Q SfM points, T
-            their sightings, m side of a mask, "." any length
+  shapes    R rays, S intervals of a ray (S + 1 samples), K intervals or points on a ray, P points,
+            N octree cells, L octree levels, C channels per level, V feature rows, G inputs of the
+            colour network from geometry, A appearance dims, I photos in all, B of them in a batch,
+            Q SfM points, T their sightings, m side of a mask, "." any length
 
-Departures from the printed paper; the tag stands at the code
-  [D1]  alpha is NeuS's Eq. 13: never negative, no beta; an interval has the mean colour of its ends
-  [D2]  E_curv is |lap s| times the step of its differences, else it explodes at edges; the sigmoid
-        of Phi is centred and scaled by running quantiles; L_curv and Phi count by the opacity of
-        the ray; lambda_curv is 2 in Eq. 4 alone
-  [D3]  M weighs L_rgb without gradient; L_reg trains it to classify rays by their error, without
-        intensity or bimodality; outliers are rejected early; M is fixed at 60 % of training
-  [D4]  L_lps is a sum of logarithms, not a product; a layer's bound is exp(c), not softplus(c)
-  [D5]  CGNet has a block a stage, GroupNorm, a head at each resolution, and reads small photos
-  [D6]  the background field also renders what lies in front of the sphere
-  [D7]  SfM points place the sphere, seed the octree, pull s and M to 0; the off-surface penalty,
-        which the paper names without a formula, keeps s positive between cameras and points that
-        they saw; s starts as a small sphere; no sphere loss with a warm-up
-  [D8]  samples and Phi follow a cached SDF; Phi has no gradient, L_GPL moves M alone; derivatives
-        are taken at and near SfM points and at one surface point a ray, whose normal (no input in
-        the paper) its colours share
-  [D9]  zeta stays between a rising floor and a fixed bound
-  [D10] cells split where colours err, none is pruned, those of the background stay as seeded; parts
-        that a scene does not need are off
+Departures from the printed paper. The tag stands at the code; .github/RESULTS.md says what each
+one is worth.
+  tag   in the paper                       here                               because
+  [D1]  alpha: a difference of sigmoids    NeuS's Eq. 13, s at both ends      printed, a surface lets
+        with a slope beta                  of an interval                     37 % of the light through
+  [D2]  E_curv = |lap s|; Phi on every     |lap s| times the step; L_eik,     |lap s| grows without
+        ray                                L_curv, Phi weighted by opacity    bound where the grid is fine
+  [D3]  L_reg: intensity and bimodality    M classifies rays by their error   printed, M takes a sky that
+        of M, which L_rgb trains, too      at that place; outliers are        one network cannot fit
+                                           rejected early; M fixed at 60 %
+  [D4]  CGNet                              a block a stage, GroupNorm, a      photos are small, batches
+                                           head at each resolution            have 8 of them
+  [D5]  a sphere loss in a warm-up         SfM points place the sphere, seed  a ball of air before a
+                                           the octree, pull s and M to 0,     facade never vanishes
+                                           and say what is air
+  [D6]  derivatives at every sample, no    at a surface point a ray, whose    five lookups a sample;
+        normal as an input                 normal colours see, and at SfM     normals help photos by
+                                           points; samples and Phi follow     half a decibel
+                                           a cached SDF
+  [D7]  zeta is learned                    within bounds, the lower rises     else surfaces stay soft,
+                                                                              and people get painted
+  [D8]  octrees are pruned                 cells split where colours err;     empty cells cost nothing;
+                                           parts that a scene does not        what is not there cannot
+                                           need are off                       fail
 """
 import argparse
 import collections
@@ -126,14 +132,14 @@ class Config:
     appearance: str = setting("auto", "codes: on, off, auto (if exposures differ)", choices=SWITCH)
     mask: str = setting("on", "transient mask: on, off", choices=("on", "off"))
     background: str = setting("auto", "a field: on, off, auto (unless one colour)", choices=SWITCH)
-    paper: str = setting("", "equations as printed: alpha, phi, reg, lps, zeta")
+    paper: str = setting("", "equations as printed: alpha, phi, reg, zeta")
     lam_eik: float = setting(0.004, "L_eik, eikonal (Permuto-SDF: 0.04)")
     lam_curv: float = setting(0.01, "L_curv, curvature: |lap s| eps [D2]")
     lam_mask: float = setting(1.0, "L_reg, which trains the mask [D3]")
     lam_gpl: float = setting(0.05, "L_GPL, geometry preservation")
-    lam_lps: float = setting(1e-5, "L_lps, Lipschitz bound, log form [D4]")
-    lam_sfm: float = setting(7.5e-3, "min(zeta, 40) |s(p)| at SfM points [D7]")
-    lam_off: float = setting(0.03, "L_off, off-surface: air that cameras see [D7]")
+    lam_lps: float = setting(3e-6, "L_lps, Lipschitz bound (as Permuto-SDF)")
+    lam_sfm: float = setting(7.5e-3, "min(zeta, 40) |s(p)| at SfM points [D5]")
+    lam_off: float = setting(0.03, "L_off, off-surface: air that cameras see [D5]")
     lr_grid: float = setting(1e-2, "octree features")
     lr_code: float = setting(3e-2, "appearance codes")
     lr_net: float = setting(4e-3, "networks")
@@ -238,7 +244,7 @@ class Scene(NamedTuple):
     points: Tensor  # (Q,3) SfM points
     masked: Tensor  # (.,) whether a user's mask file excludes the pixel; (0,) without such files
     thumbs: Tensor  # (I,3,2m,2m) uint8, whole photos for the mask network
-    sfm_pixels: Tensor  # (I,m,m) mask pixels in which the photo saw an SfM point [D7]
+    sfm_pixels: Tensor  # (I,m,m) mask pixels in which the photo saw an SfM point [D5]
     train: Tensor  # (.,) indices of the training photos
     test: Tensor  # (.,) indices of the held-out photos
     raw: dict  # the file in numpy: names, statistics, center, scale, ground truth of the toy
@@ -248,7 +254,7 @@ class Scene(NamedTuple):
 def load_scene(raw, device="cpu"):
     """Scene from the dictionary of a scene file (data_prep.open_scene, make_toy or prepare)."""
     mask_side = int(np.clip(np.median(raw["wh"].max(1)) / 4, 32, 128))  # px
-    side = 2 * mask_side  # px, half of a usual photo's long side; photos become squares [D5]
+    side = 2 * mask_side  # px, half of a usual photo's long side; photos become squares [D4]
     thumbs = [
         cv2.resize(pixels.reshape(h, w, 3), (side, side), interpolation=cv2.INTER_AREA)
         for pixels, (w, h) in zip(np.split(raw["rgb"], raw["start"][1:-1]), raw["wh"])]
@@ -289,7 +295,7 @@ class Rays(NamedTuple):
     img: Tensor  # (R,) photo index
     uv: Tensor  # (R,2) pixel position over photo size, 0..1
     rgb: Tensor  # (R,3) the photo's colour
-    has_sfm: Tensor  # (R,) whether the mask's pixel shows an SfM point [D7]
+    has_sfm: Tensor  # (R,) whether the mask's pixel shows an SfM point [D5]
     is_masked: Tensor  # (R,) whether a user's mask file excludes the pixel
 
     def at(self, t):
@@ -548,7 +554,7 @@ def in_chunks(function, x):
 def seed_octree(octree, points, dense):
     """Splits every cell of the first `dense` levels; then twice, if there are as many levels, the
     cell of each point of points (P,3) and its 26 neighbours, so that no corner of that cell is
-    hanging. Features are then drawn at random. [D7]"""
+    hanging. Features are then drawn at random. [D5]"""
     for _ in range(dense):
         octree.split(octree.cells)
     for _ in range(2):
@@ -560,7 +566,7 @@ def seed_octree(octree, points, dense):
 def cells_to_split(octree):
     """Cells (N,4) to split: those with the largest summed errors, until they hold SPLIT_SHARE of
     it. Only cells whose children would be larger than a pixel count. Errors are recorded in cells
-    that are not split. [D10]"""
+    that are not split. [D8]"""
     level = octree.cells[:, 0]  # (N,)
     error, pixel, count = octree.cell_error.T  # (N,) sums over rays
     is_coarse = pixel < count * octree.side[level] / 2  # mean size of a pixel under a child's side
@@ -577,7 +583,7 @@ def cells_to_split(octree):
 # ---- 4 Fields: the networks on top of the octree -------------------------------------------------
 
 GEOMETRY_FEATURES = 15  # that the SDF network hands to the colour network
-START_RADIUS = 0.25  # of the sphere that s starts as, inside the landmark to which it grows [D7]
+START_RADIUS = 0.25  # of the sphere that s starts as, inside the landmark to which it grows [D5]
 
 
 @functools.cache
@@ -636,7 +642,7 @@ def eikonal(grad):
 
 def off_surface_loss(sdf, margin):
     """L_off, the paper's off-surface penalty: s (P,) is at least margin at points that are known to
-    be air. The paper names it without a formula. [D7]"""
+    be air. The paper names it without a formula. [D5]"""
     return F.relu(margin - sdf).mean()
 
 
@@ -659,7 +665,7 @@ class SDFField(nn.Module):
         feat = self.octree(x)  # (...,LC)
         out = self.network(torch.cat([x, feat], -1))  # (...,1+GEOMETRY_FEATURES)
         offset, geo = out.split([1, GEOMETRY_FEATURES], -1)
-        sdf = x.norm(dim=-1) - START_RADIUS + offset.squeeze(-1)  # (...) [D7]
+        sdf = x.norm(dim=-1) - START_RADIUS + offset.squeeze(-1)  # (...) [D5]
         return sdf, torch.cat([geo, feat], -1)
 
     def derivatives(self, x, eps):
@@ -669,26 +675,24 @@ class SDFField(nn.Module):
 
 
 class LipschitzLinear(nn.Linear):
-    """A layer whose rows are scaled to an L1 norm of at most exp(c), with c learned: its Lipschitz
-    bound in the max norm (Liu et al. 2022, who have softplus for exp). [D4]"""
+    """A layer whose rows are scaled to an L1 norm of at most softplus(c), with c learned: its
+    Lipschitz bound in the max norm (Liu et al. 2022)."""
     def __init__(self, inputs, outputs):
         super().__init__(inputs, outputs)
-        self.c = nn.Parameter(self.weight.abs().sum(1).max().log())
+        bound = self.weight.abs().sum(1).max()
+        self.c = nn.Parameter(bound.expm1().log())
+
+    def bound(self):
+        return F.softplus(self.c)
 
     def forward(self, x):
-        scale = (self.c.exp() / self.weight.abs().sum(1, keepdim=True)).clamp_max(1)  # (out,1)
+        scale = (self.bound() / self.weight.abs().sum(1, keepdim=True)).clamp_max(1)  # (out,1)
         return F.linear(x, self.weight * scale, self.bias)
 
 
 def lipschitz_loss(network):
-    """L_lps: log of the network's bound, which is the product of its layers'. The gradient of the
-    product itself changes by orders of magnitude with width and training. [D4]"""
-    return sum(layer.c for layer in network[::2])
-
-
-def paper_lipschitz_loss(network):
-    """L_lps as in Liu et al. 2022: the network's bound. Permuto-SDF weights it by 3e-6."""
-    return lipschitz_loss(network).exp()
+    """L_lps: the network's Lipschitz bound, which is the product of its layers' (Liu et al. 2022)."""
+    return math.prod(layer.bound() for layer in network[::2])
 
 
 # ---- 5 From SDF to colour: alpha, compositing, samples, background -------------------------------
@@ -757,7 +761,7 @@ def importance_samples(probes, alpha, jitter):
 
 class SDFCache(nn.Module):
     """s, E_grad and E_curv on a dense grid, renewed every CACHE_EVERY steps. It guides where samples
-    lie along a ray [D8] and gives the complexity of the geometry along it (Eq. 4)."""
+    lie along a ray [D6] and gives the complexity of the geometry along it (Eq. 4)."""
     def __init__(self, n):
         super().__init__()
         self.n = n
@@ -785,7 +789,7 @@ class SDFCache(nn.Module):
         return self.lookup(x, slice(0, 1))[0]
 
     def errors(self, x):
-        """E_grad and E_curv (R,) of rays with samples x (R,K,3): ray-wise averages. Eq. 4 [D8]"""
+        """E_grad and E_curv (R,) of rays with samples x (R,K,3): ray-wise averages. Eq. 4 [D6]"""
         return self.lookup(x, slice(1, 3)).mean(2)
 
 
@@ -888,7 +892,7 @@ def surface_depth(t, sdf, w):
 
 def shade(model, rays, code, hits, normal):
     """Colours (R,3) of rays with hits and normals (R,3) at their surface points. All samples of a
-    ray share its normal, which is no input in the paper. [D8]"""
+    ray share its normal, which is no input in the paper. [D6]"""
     per_ray = torch.cat([normal, rays.d, code], 1)  # (R,3+3+A)
     rgb = colors_of(model.color, hits.geo, per_ray)  # (R,S+1,3)
     rgb = torch.einsum("rs,rsc->rc", hits.w, rgb)  # (R,3)
@@ -947,7 +951,7 @@ def paper_phi(ray_complexity):
 
 def gpl_loss(mask, phi):
     """L_GPL, Eq. 3: the mean of M(r) Phi(r); the mask must not erase edges of the structure. Phi
-    has no gradient: the loss moves the mask, never the SDF. [D8]"""
+    has no gradient: the loss moves the mask, never the SDF. [D6]"""
     return (mask * phi).mean()
 
 
@@ -1010,12 +1014,12 @@ def conv(inputs, outputs, stride):
     return nn.Sequential(
         nn.Conv2d(inputs, outputs, 3, stride, padding=1, bias=False),
         nn.GroupNorm(8, outputs),
-        nn.ReLU())  # [D5]
+        nn.ReLU())  # [D4]
 
 
 class ContextBlock(nn.Module):
     """Context-guided block (CGNet Fig. 3), from n channels to 2n at half the resolution: local and
-    dilated context, gated globally; no residual, no 1x1. [D5]"""
+    dilated context, gated globally; no residual, no 1x1. [D4]"""
     def __init__(self, n, dilation):
         super().__init__()
         self.reduce = conv(n, n, stride=2)
@@ -1041,7 +1045,7 @@ def sample_logits(logits, uv):
 
 class TransientMask(nn.Module):
     """CGNet (as in CR-NeRF), which gives M. The head reads all three resolutions: at 1/8 alone a
-    mask could not follow an outline. [D5]"""
+    mask could not follow an outline. [D4]"""
     def __init__(self, thumbs):
         super().__init__()
         self.stages = nn.Sequential(
@@ -1067,13 +1071,13 @@ class TransientMask(nn.Module):
 # ---- 7 The model and its objective ---------------------------------------------------------------
 
 START_ZETA = 20
-ZETA_FLOOR = 15, 80  # lower bound of zeta at first, and from ZETA_RISE of training on [D9]
+ZETA_FLOOR = 15, 80  # lower bound of zeta at first, and from ZETA_RISE of training on [D7]
 MAX_PULL = 40  # zeta up to which L_sfm and L_off grow stronger
 CACHE_EVERY = 128  # steps between renewals of the cache
 
 
 class Parts(NamedTuple):
-    """What is modelled: no more than a scene needs. [D10]"""
+    """What is modelled: no more than a scene needs. [D8]"""
     levels: int  # of the octree
     appearance_dim: int  # A, 0: no appearance codes
     has_background: bool  # or one colour
@@ -1095,7 +1099,7 @@ def needed_parts(cfg, raw):
 
 
 def objective(loss, cfg):
-    """L, the weighted sum of losses in the paper's order, with one term more, for SfM points [D7].
+    """L, the weighted sum of losses in the paper's order, with one term more, for SfM points [D5].
     lambda_rgb is 1. Eq. 5"""
     return (
         loss["rgb"]
@@ -1192,7 +1196,7 @@ class GeoNVS(nn.Module):
         sfm = self.sfm[random_index(gen, len(self.sfm), n)]  # (n,3)
         start, end = self.air[random_index(gen, len(self.air), n)].unbind(1)  # (n,3)
         air = start.lerp(end, uniform(gen, n, 1))  # (n,3)
-        # one lookup is faster than three [D8]
+        # one lookup is faster than three [D6]
         points = torch.cat([hits.point, sfm, air])  # (R+2n,3)
         s, grad, lap = self.sdf.derivatives(points, self.eps)  # (R+2n,), (R+2n,3), (R+2n,)
         opacity = hits.opacity.detach()
@@ -1202,7 +1206,7 @@ class GeoNVS(nn.Module):
         residual = (rgb - rays.rgb).abs()  # (R,3)
         error = residual.detach().amax(1)  # (R,) of the worst channel
         left_out, reg, gpl, phi = self.transients(rays, photos, hits, error, done)
-        pull = self.zeta().detach().clamp_max(MAX_PULL)  # at first s must be free to change [D7]
+        pull = self.zeta().detach().clamp_max(MAX_PULL)  # at first s must be free to change [D5]
         _, s_sfm, s_air = s.split([R, n, n])
         loss = dict(
             rgb=((1 - left_out) * residual.mean(1)).mean(),  # [D3]
@@ -1210,9 +1214,9 @@ class GeoNVS(nn.Module):
             curv=(opacity * lap[:R].abs()).mean() * self.eps,  # [D2]
             reg=reg,
             gpl=gpl,
-            lps=(paper_lipschitz_loss if cfg.printed("lps") else lipschitz_loss)(self.color),
-            off=pull * off_surface_loss(s_air, self.sdf.octree.finest),  # [D7]
-            sfm=pull * s_sfm.abs().mean())  # [D7]
+            lps=lipschitz_loss(self.color),
+            off=pull * off_surface_loss(s_air, self.sdf.octree.finest),  # [D5]
+            sfm=pull * s_sfm.abs().mean())  # [D5]
         self.remember(rays, hits, error)
         log = loss | dict(
             mse=residual.square().mean(),
@@ -1236,7 +1240,7 @@ class GeoNVS(nn.Module):
                 logit = sample_logits(self.mask.logits(photos), rays.uv)  # (R,)
             M = logit.sigmoid()
             is_counted = ~rays.is_masked
-            # SfM pixels count as if they had no error: they train M = 0 [D7]
+            # SfM pixels count as if they had no error: they train M = 0 [D5]
             error = error.masked_fill(rays.has_sfm, 0)
             if self.cfg.printed("reg"):
                 reg = paper_mask_loss(M * is_counted, error)
@@ -1250,7 +1254,7 @@ class GeoNVS(nn.Module):
 
     def remember(self, rays, hits, error):
         """Follows the errors (R,) of a step's rays: for the mask's threshold those of a place, for
-        refinement those of the octree's cells at surface points. [D3] [D10]"""
+        refinement those of the octree's cells at surface points. [D3] [D8]"""
         self.usual_errors.update(hits.place, error, ~rays.is_masked)
         is_solid = hits.opacity > 0.5  # (R,)
         pixel = hits.depth / self.scene.K[rays.img, 0]  # (R,) its size at the surface point
@@ -1264,7 +1268,7 @@ class GeoNVS(nn.Module):
         """Keeps zeta within bounds and renews the cache. The floor of zeta rises with training
         (done: 0..1): while surfaces are soft the model can paint people, so that they have small
         errors and are not masked, and then surfaces stay soft. The upper bound is a width 1 / zeta
-        of 1/64 of an even interval, 2 / S; thinner surfaces get no gradient. [D9]"""
+        of 1/64 of an even interval, 2 / S; thinner surfaces get no gradient. [D7]"""
         start, end = ZETA_FLOOR
         lower = start + (end - start) * min(done / ZETA_RISE, 1.0)
         upper = 32 * self.cfg.samples
@@ -1302,7 +1306,7 @@ class GeoNVS(nn.Module):
     def refine(self, optimizer, processes=ALONE):
         """Splits cells where colours err, and the neighbours that share a face with them, as the
         outer corners of a single layer of cells would hang. Adam's moments move along with their
-        features. [D10]"""
+        features. [D8]"""
         octree = self.sdf.octree
         processes.sum(octree.cell_error)
         # sums of floats differ between GPUs: one process chooses the cells for all
