@@ -630,8 +630,8 @@ def finite_differences(s, taps, eps):
     """Gradient (P,3) and Laplacian (P,) of a field from its values s (P,5) at x + eps taps: x
     itself, then the corners of a tetrahedron (Neuralangelo's code; its paper has six)."""
     grad = 3 / (4 * eps) * (s @ taps)  # (P,3) as the sum of k k^T over corners k is 4/3 I
-    # the mean over a sphere of radius eps is s + eps^2 lap / 6
-    lap = 6 / eps**2 * (s[:, 1:].mean(1) - s[:, 0])
+    # the mean over the four corners is s + eps^2 lap / 6; s itself is one of five values here
+    lap = 6 / eps**2 * 5 / 4 * (s.mean(1) - s[:, 0])
     return grad, lap
 
 
@@ -867,8 +867,7 @@ def trace_rays(model, rays, code, jitter):
     depth = surface_depth(t, sdf.detach(), w.detach())
     point = rays.at(depth[:, None])[:, 0]  # (R,3)
     # an interval has the mean colour of its ends, so each of them gets half of its weight [D1]
-    w = F.pad(w, (1, 1))  # (R,S+2)
-    w = 0.5 * (w[:, :-1] + w[:, 1:])  # (R,S+1)
+    w = F.avg_pool1d(w, 2, stride=1, padding=1)  # (R,S+1)
 
     bg_color = model.bg_color.expand_as(rays.d)  # (R,3)
     bg_place = 2 * rays.d  # (R,3) infinity
