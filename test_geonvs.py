@@ -3582,11 +3582,9 @@ class Splats(Rival):
         picked = photos[geonvs.random_index(gen, len(photos), 1)]
         size = 0.5 + 0.5 * geonvs.uniform(gen, 1)
         corner = geonvs.uniform(gen, 2) * (1 - size)
-        axis = torch.linspace(0, 1, math.isqrt(n), device=gen.device)
-        uv = torch.cartesian_prod(axis, axis).flip(1) * size + corner  # (R,2)
-        side = len(axis) // TILE
-        tiles = uv.view(side, TILE, side, TILE, 2).transpose(1, 2)
-        uv = tiles.reshape(-1, 2)
+        axis = torch.linspace(0, 1, math.isqrt(n), device=gen.device).view(-1, TILE)
+        row, col = torch.broadcast_tensors(axis[:, None, :, None], axis[:, None])
+        uv = torch.stack([col, row], 4).view(-1, 2) * size + corner  # (R,2)
         wh = self.scene.wh[picked]  # (1,2)
         xy = (uv * (wh - 1)).round().long()  # (R,2)
         pixel = xy[:, 1] * wh[:, 0] + xy[:, 0]
@@ -3796,7 +3794,8 @@ def run_row(run, given, row):
         saved = dict(key=key, metrics=train_row(cfg, arrays, run, row.kind))
         data_prep.atomic_write(path, lambda part: part.write_text(json.dumps(saved)))
     metrics = saved["metrics"]
-    print(f"{run}: {metrics.get('failed') or metrics['psnr']}", flush=True)
+    result = metrics.get("failed") or f"{metrics['psnr']:.2f} dB"
+    print(f"{run}: {result}", flush=True)
     return metrics
 
 
@@ -3923,6 +3922,7 @@ def draw():
         axis = figure.add_subplot(high, 2, number + 1, title=path.stem)
         draw_chart(axis, read_table(path))
     data_prep.atomic_write(Path("chart.png"), lambda part: figure.savefig(part, dpi=110))
+    print("wrote chart.png")
 
 
 def spread_out(values, gap):
