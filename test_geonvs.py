@@ -8,7 +8,6 @@ import contextlib
 import copy
 import csv
 import functools
-import importlib.util
 import io
 import itertools
 import json
