@@ -8,7 +8,6 @@ import contextlib
 import copy
 import csv
 import functools
-import importlib.util
 import io
 import itertools
 import json
@@ -3333,19 +3332,19 @@ def test_each_setting_is_used_and_explained(monkeypatch):
     assert len(text.splitlines()) <= 50  # a screen
 
 
-# ==== Part II: the rivals, and the experiments by name ============================================
-#     python test_geonvs.py chart    speed against accuracy: Geo-NVS-w and its rivals by budget
-#     python test_geonvs.py paper    the paper's equations as printed; mask and GPL; density for SDF
-#     python test_geonvs.py pieces   ablation
+# ==== Part II: rivals and experiments =============================================================
+#     python test_geonvs.py parts    each equation as printed, each loss and each part left out
+#     python test_geonvs.py chart    PSNR over training time: Geo-NVS-w and its rivals
 #     python test_geonvs.py grid     the octree against a uniform grid
-#     python test_geonvs.py stress   where methods fail: cells of the toy with knobs turned together
-# Flags of geonvs.py apply (--data, --downscale, --minutes, --steps ...) unless a row sets them, and
-# --seeds, --published. A row is a whole run, scored as by geonvs.py; a run that is there already is
-# read again. Writes NAME.csv and NAME.png. Shapes beside those of geonvs.py: N Gaussians, B tiles
+#     python test_geonvs.py stress   toys on which methods fail
+#     python test_geonvs.py draw     chart.png from chart*.csv of this folder
+# Flags of geonvs.py apply (--data, --downscale, --minutes, --steps ...) unless a row sets them;
+# --seeds is their number. A row is a whole training, scored as by geonvs.py; one that is there
+# already is read again. Writes NAME.csv. Shapes beside those of geonvs.py: N Gaussians, B tiles
 # with P pixels and D Gaussians each.
 
 
-# ---- Rivals: NeRF-W and Ha-NeRF ------------------------------------------------------------------
+# ---- Rival: NeRF-W -------------------------------------------------------------------------------
 
 class Rival(nn.Module):
     """What training and scoring ask of any model, where it does nothing special."""
@@ -3356,10 +3355,9 @@ class Rival(nn.Module):
 
     def __init__(self, cfg, scene):
         super().__init__()
-        self.cfg = replace(cfg, mask="off")
+        self.cfg = replace(cfg)
         self.has_mask = False
         self.scene = scene
-        self.make_parts(cfg, scene)
 
     def groups(self):
         return [dict(params=list(self.parameters()), base_lr=self.cfg.lr_net, **self.adam)]
@@ -3404,13 +3402,8 @@ class RadianceField(nn.Module):
         h = self.second(torch.cat([pe, h], 2))  # (R,S,W)
         sigma = F.softplus(self.density(h)).squeeze(2)  # (R,S)
         neck = self.bottleneck(h)  # (R,S,W)
-        return sigma, self.paint(neck, d, code), neck
-
-    def paint(self, neck, d, code):
-        """Colour (R,S,3) of samples with bottleneck (R,S,W), under an appearance code (R,A)."""
         per_ray = torch.cat([positional(d, 4), code], 1)  # (R,27+A)
-        per_ray = per_ray[:, None].expand(-1, neck.shape[1], -1)
-        return self.color(torch.cat([neck, per_ray], 2)).sigmoid()
+        return sigma, geonvs.colors_of(self.color, neck, per_ray), neck
 
 
 class NeRFW(Rival):
@@ -3419,43 +3412,34 @@ class NeRFW(Rival):
     width 256, 64 + 64 samples, beta_min 0.03, Adam 5e-4, 1024 rays, SfM near and far."""
     name = "nerfw"
     code_dim = 48
-    finer = 1  # samples in scoring over samples in training
 
-    def make_parts(self, cfg, scene):
+    def __init__(self, cfg, scene):
+        super().__init__(cfg, scene)
         octaves = int(1 + math.log2(math.pi / scene.raw["footprint"]))  # the last has two pixels
         self.coarse = RadianceField(cfg.hidden, self.code_dim, octaves)
         self.fine = RadianceField(cfg.hidden, self.code_dim, octaves)
         reach = torch.cdist(scene.c2w[:, :, 3], scene.points[::20])  # (I,K/20)
         self.far = nn.Buffer(reach.quantile(0.95, dim=1))  # (I,) the farthest points are wild
-        self.make_heads(len(scene.wh), cfg.hidden // 2)
-
-    def make_heads(self, photos, half):
-        self.appearance = nn.Embedding(photos, self.code_dim)
-        self.transient = nn.Embedding(photos, 16)
-        self.head = nn.Sequential(
-            layers(2 * half + 16, *[half] * 4),
-            nn.Linear(half, 5))
+        self.appearance = nn.Embedding(len(scene.wh), self.code_dim)
+        self.transient = nn.Embedding(len(scene.wh), 16)
+        half = cfg.hidden // 2
+        self.head = nn.Sequential(layers(2 * half + 16, *[half] * 4), nn.Linear(half, 5))
 
     def render(self, rays, code):
-        n = self.cfg.samples
-        if not torch.is_grad_enabled():
-            n *= self.finer
-        middle = code.new_full((len(code), 2 * n), 0.5)
+        middle = code.new_full((2, len(code), self.cfg.samples), 0.5)
         return self.trace(rays, code, middle)
 
     def trace(self, rays, code, jitter, other=None):
-        """Coarse and fine pass with n samples and 2n. jitter: (R,2n) in 0..1, stratified twice;
-        other: codes (R,16) of the transient head."""
-        n = jitter.shape[1] // 2
-        stratum = torch.arange(n, device=code.device).repeat(2)  # (2n,)
-        u = (stratum + jitter) / n  # (R,2n)
+        """Coarse and fine pass with n samples and 2n. jitter: (2,R,n) in 0..1, for each network's
+        own samples; other: codes (R,16) of the transient head."""
+        coarse_jitter, fine_jitter = jitter
         far = self.far[rays.img, None]  # (R,1)
-        share = torch.linspace(0, 1, n + 1, device=code.device)
-        edges = torch.lerp(rays.near, far, share)  # (R,n+1)
-        t = torch.lerp(rays.near, far, u[:, :n])  # (R,n)
+        t = torch.lerp(rays.near, far, geonvs.stratified(coarse_jitter))  # (R,n)
         coarse = self.pass_through(self.coarse, rays, t, code)
         weight = coarse["w"].detach() + 1e-3
-        t_fine = geonvs.inverse_cdf(edges, weight, u[:, n:].contiguous())  # (R,n)
+        share = torch.linspace(0, 1, self.cfg.samples + 1, device=code.device)
+        edges = torch.lerp(rays.near, far, share)  # (R,n+1)
+        t_fine = geonvs.inverse_cdf(edges, weight, geonvs.stratified(fine_jitter))  # (R,n)
         t, _ = torch.cat([t, t_fine], 1).sort(1)  # (R,2n)
         out = self.pass_through(self.fine, rays, t, code, other)
         normal = torch.zeros_like(out["rgb"])  # for panels
@@ -3469,8 +3453,7 @@ class NeRFW(Rival):
         alpha = 1 - torch.exp(-sigma * dt)  # (R,S)
         if other is None:
             w = geonvs.composite(alpha)  # (R,S)
-            picture = torch.einsum("rs,rsc->rc", w, rgb)
-            return dict(rgb=picture, w=w, neck=neck)
+            return dict(rgb=torch.einsum("rs,rsc->rc", w, rgb), w=w)
         other = other[:, None].expand(-1, t.shape[1], -1)  # (R,S,16)
         h = self.head(torch.cat([neck, other], 2))  # (R,S,5)
         sigma_t, rgb_t, beta = h.split([1, 3, 1], 2)
@@ -3483,15 +3466,12 @@ class NeRFW(Rival):
         static = torch.einsum("rs,rsc->rc", trans * alpha, rgb)
         moving = torch.einsum("rs,rsc->rc", w_t, rgb_t.sigmoid())
         beta = w_t * F.softplus(beta).squeeze(2)
-        return dict(
-            rgb=static + moving,
-            w=w,
-            sigma_t=sigma_t,
-            beta=beta.sum(1) + 0.03)
+        beta = beta.sum(1) + 0.03
+        return dict(rgb=static + moving, w=w, sigma_t=sigma_t, beta=beta)
 
     def losses(self, rays, photos, done, gen):
         """Squared error over learned variance, its log, a penalty on transients. NeRF-W Eq. 13"""
-        jitter = geonvs.uniform(gen, len(rays.o), 2 * self.cfg.samples)
+        jitter = geonvs.uniform(gen, 2, len(rays.o), self.cfg.samples)
         code = self.appearance(rays.img)
         out = self.trace(rays, code, jitter, self.transient(rays.img))
         error = ((out["rgb"] - rays.rgb) ** 2).sum(1)  # (R,)
@@ -3506,104 +3486,13 @@ class NeRFW(Rival):
         return sum(terms.values()), terms | dict(mse=mse), out
 
 
-class HaNeRF(NeRFW):
-    """Ha-NeRF (Chen et al. 2022): appearance from a CNN over the photo, mask by an MLP of pixels.
-    From the authors' code: network sizes, 64 + 64 samples (256 + 256 in scoring), one 32x32 grid of
-    rays a step, loss weights, Adam 5e-4. Left out: the mode-seeking term (weight 1e-6), noise on
-    densities."""
-    name = "hanerf"
-    finer = 4
-    step = 0
-
-    def make_heads(self, photos, half):
-        parts = []
-        inputs = 3
-        for outputs, kernel, stride in (64, 7, 1), (128, 4, 2), *[(256, 4, 2)] * 3:
-            pad = (kernel - 1) // 2
-            layer = nn.Conv2d(inputs, outputs, kernel, stride, pad, padding_mode="reflect")
-            parts += [layer, nn.ReLU()]
-            inputs = outputs
-        self.encoder = nn.Sequential(
-            *parts,
-            nn.AdaptiveAvgPool2d(1),
-            nn.Conv2d(256, self.code_dim, 1),
-            nn.Flatten())
-        self.bank = nn.Buffer(torch.zeros(photos, self.code_dim))  # last code of each photo
-        self.mask_code = nn.Embedding(photos, 128)
-        self.mask_mlp = nn.Sequential(
-            layers(128 + 42, *[256] * 4),
-            nn.Linear(256, 1),
-            nn.Sigmoid())
-
-    def encode(self, photos):
-        return self.encoder(self.scene.thumbs[photos] / 127.5 - 1)
-
-    @torch.no_grad()
-    def codes(self):
-        photos = torch.arange(len(self.scene.wh), device=self.bank.device)
-        return torch.cat([self.encode(some) for some in photos.split(8)])
-
-    def batch(self, n, gen):
-        """A square grid of rays over a random window of one photo."""
-        photos = self.scene.train
-        picked = photos[geonvs.random_index(gen, len(photos), 1)]
-        size = 0.5 + 0.5 * geonvs.uniform(gen, 1)
-        corner = geonvs.uniform(gen, 2) * (1 - size)
-        axis = torch.linspace(0, 1, math.isqrt(n), device=gen.device)
-        uv = torch.cartesian_prod(axis, axis).flip(1) * size + corner  # (R,2)
-        wh = self.scene.wh[picked]  # (1,2)
-        xy = (uv * (wh - 1)).round().long()  # (R,2)
-        pixel = xy[:, 1] * wh[:, 0] + xy[:, 0]
-        rays = geonvs.make_rays(self.scene, picked.expand_as(pixel), pixel)
-        return rays, picked
-
-    def losses(self, rays, photos, done, gen):
-        """Masked colour, a falling penalty on masks, codes that survive a render of the
-        same rays in another photo's light. Ha-NeRF Eq. 9"""
-        R = len(rays.o)
-        side = math.isqrt(R)
-        jitter = geonvs.uniform(gen, R, 2 * self.cfg.samples)
-        code = self.encode(photos)  # (1,A)
-        other = self.bank[geonvs.random_index(gen, len(self.bank), 1)]
-        other = torch.where(other.any(), other, code.detach())  # (1,A) of another, once known
-        self.bank[photos] = code.detach()
-        codes = code.expand(R, -1)
-        out = self.trace(rays, codes, jitter, other.expand(R, -1))
-        place = positional(rays.uv, 10)
-        pixel = torch.cat([self.mask_code(rays.img), place], 1)
-        mask = self.mask_mlp(pixel).squeeze(1)  # (R,)
-        error = ((out["rgb"] - rays.rgb) ** 2).mean(1)  # (R,)
-        coarse = ((out["coarse"] - rays.rgb) ** 2).mean(1)
-        picture = out["other"].T.reshape(1, 3, side, side)
-        again = self.encoder(2 * picture - 1)  # (1,A)
-        penalty = max(6e-3, 5e-2 * math.exp(-1e-3 * self.step))
-        self.step += 1
-        terms = dict(
-            rgb=((1 - mask) * error).mean() / 2,
-            coarse=((1 - mask.detach()) * coarse).mean() / 2,
-            size=penalty * (mask**2).mean(),
-            code=1e-5 * (code**2).mean(),
-            again=1e-3 * (again - other).abs().mean())
-        mse = error.detach().mean()
-        return sum(terms.values()), terms | dict(mse=mse), out
-
-    def pass_through(self, field, rays, t, code, other=None):
-        """The static picture; with the codes (R,A) of another photo also its colours there."""
-        out = super().pass_through(field, rays, t, code)
-        if other is not None:
-            rgb = field.paint(out["neck"].detach(), rays.d, other)  # only colours learn
-            out["other"] = torch.einsum("rs,rsc->rc", out["w"].detach(), rgb)
-        return out
-
-
 # ---- Rival: Gaussian splats ----------------------------------------------------------------------
 
-TILE = 8  # px
-REACH = 3.0  # standard deviations after which a Gaussian is left out of a tile
+TILE = 4  # rays along an axis that are drawn together in training
+REACH = 3.0  # standard deviations after which a Gaussian is left out
 BLUR = 0.3  # px^2 added to a projected covariance: a pixel's own width (EWA splatting)
 SHELL = 1000  # Gaussians that begin in the sky
 FEATURE = 16  # numbers that a Gaussian's colour is made of
-SPLATS = dict(rays=1024, photos=1, hidden=64)
 
 
 def rotation(q):
@@ -3631,82 +3520,44 @@ def project(x, axes, K):
     return center, half @ half.mT + BLUR * one
 
 
-def place_in_group(group):
-    """For group numbers (M,), how many equal ones stand before each."""
-    order = group.argsort(stable=True)
-    count = group.bincount()
-    first = count.cumsum(0) - count
-    rank = torch.arange(len(group), device=group.device)
-    place = torch.empty_like(group)
-    place[order] = rank - first[group[order]]
-    return place
-
-
-def tile_lists(low, high, corner):
-    """Table (B,D) of the Gaussians with boxes low, high (N,2), front first, that touch tiles with
-    corners (B,2) px; its empty places hold N."""
-    corner = corner[:, None]  # (B,1,2)
-    touches = (low < corner + TILE) & (high > corner)  # (B,N,2)
-    touches = touches.all(2)  # (B,N)
-    D = touches.sum(1).max().item()
-    table = torch.full((len(corner), D), len(low), device=low.device)
-    tile, which = touches.nonzero().unbind(1)
-    table[tile, place_in_group(tile)] = which
-    return table
-
-
 def splat(center, cov, opacity, rgb, xy):
-    """Colour (R,3) of pixels xy (R,2) and what passes all Gaussians (R,), which come front first:
-    alpha = opacity exp(-1/2 d^T cov^-1 d), composited as samples of a ray are (Kerbl et al.
-    2023 Eq. 3). In a tile log alpha is a polynomial of the pixel's place, so all of them are one
-    product of matrices."""
+    """Colour (B,P,C) of pixels xy (B,P,2) of tiles, and what passes all Gaussians (B,P), which come
+    front first: alpha = opacity exp(-1/2 d^T cov^-1 d), composited as samples of a ray are (Kerbl
+    et al. 2023 Eq. 3). A tile's D Gaussians are those that reach its bounding box."""
     variance = cov.detach().diagonal(dim1=1, dim2=2)  # (N,2)
     reach = REACH * variance.sqrt()
-    low = center.detach() - reach
-    high = center.detach() + reach
-    col, row = (xy / TILE).long().unbind(1)
-    number, of_ray = (row * 2**16 + col).unique(return_inverse=True)  # (B,), (R,)
-    corner = TILE * torch.stack([number % 2**16, number // 2**16], 1)  # (B,2)
-    middle = corner + TILE / 2
-    table = tile_lists(low, high, corner)  # (B,D)
+    low = xy.amin(1, keepdim=True) - reach  # (B,N,2)
+    high = xy.amax(1, keepdim=True) + reach
+    is_near = ((center > low) & (center < high)).all(2)  # (B,N)
+    rank = torch.arange(len(center), 0, -1, device=center.device)
+    D = is_near.sum(1).max().item()
+    rank, index = (is_near * rank).topk(D)  # (B,D) front first, then some that are not near
+    is_near = rank > 0  # (B,D)
 
     a, b, _, c = cov.flatten(1).unbind(1)
     inverse = torch.stack([c, -b, a], 1) / (a * c - b * b)[:, None]  # (N,3)
-    columns = torch.cat([center, inverse, opacity[:, None], rgb], 1)  # (N,9)
-    columns = F.pad(columns, (0, 0, 0, 1))  # (N+1,9) the last one is transparent
-    columns = F.embedding(table, columns)  # (B,D,9)
-    x, y = (columns[..., :2] - middle[:, None]).unbind(2)  # (B,D) from the tile's middle
-    a, b, c, opacity = columns[..., 2:6].unbind(2)  # (B,D)
-    slope_x = a * x + b * y
-    slope_y = b * x + c * y
-    at_middle = torch.log(opacity + 1e-12) - (slope_x * x + slope_y * y) / 2
-    factors = torch.stack([at_middle, slope_x, slope_y, a, b, c], 1)  # (B,6,D)
-
-    place = place_in_group(of_ray)  # (R,)
-    u, v = (xy - middle[of_ray]).unbind(1)  # (R,)
-    one = torch.ones_like(u)
-    of_pixel = torch.stack([one, u, v, -u * u / 2, -u * v, -v * v / 2], 1)  # (R,6)
-    P = place.max().item() + 1
-    powers = xy.new_zeros(len(number), P, 6)  # (B,P,6)
-    powers[of_ray, place] = of_pixel
-    log_alpha = powers @ factors  # (B,P,D)
-    alpha = log_alpha.clamp(max=-1e-3).exp()
-    w = geonvs.composite(alpha.flatten(0, 1))  # (BP,D)
-    trans = 1 - w.sum(1)  # (BP,)
-    w = w.unflatten(0, (-1, P))
-    picture = w @ columns[..., 6:]  # (B,P,3)
-    which = of_ray * P + place  # (R,)
-    return picture.flatten(0, 1)[which], trans[which]
+    columns = torch.cat([center, inverse, opacity[:, None], rgb], 1)  # (N,6+C)
+    columns = F.embedding(index, columns)  # (B,D,6+C)
+    center, inverse, opacity, rgb = columns.split([2, 3, 1, rgb.shape[1]], 2)
+    x, y = (xy[:, :, None] - center[:, None]).unbind(3)  # (B,P,D)
+    a, b, c = inverse[:, None].unbind(3)  # (B,1,D)
+    power = a * x * x + 2 * b * x * y + c * y * y  # (B,P,D)
+    alpha = (opacity * is_near[..., None]).mT * torch.exp(-power / 2)
+    w = geonvs.composite(alpha.clamp(max=0.999).flatten(0, 1))  # (BP,D)
+    w = w.unflatten(0, xy.shape[:2])
+    return w @ rgb, 1 - w.sum(2)
 
 
-class PlainSplats(Rival):
+class Splats(Rival):
     """3D Gaussians (Kerbl et al. 2023) with appearance codes: a Gaussian has a feature, a small
-    network makes its colour of that and a photo's code."""
-    name = "plain splats"
+    network makes its colour of that and a photo's code. The transient mask is this project's, as
+    splats in the wild have one."""
+    name = "splats"
     adam = dict(betas=(0.9, 0.999), eps=1e-15)
-    batch = HaNeRF.batch
+    mask_rays = geonvs.GeoNVS.transients
 
-    def make_parts(self, cfg, scene):
+    def __init__(self, cfg, scene):
+        super().__init__(cfg, scene)
         radius = scene.points.norm(dim=1).max().clamp(min=3)
         sky = F.normalize(torch.randn(SHELL, 3))
         center = torch.cat([scene.points, 2 * radius * sky])  # (N,3)
@@ -3724,33 +3575,49 @@ class PlainSplats(Rival):
         self.paint = geonvs.mlp(FEATURE + cfg.appearance_dim, cfg.hidden, 3)
         self.appearance = nn.Embedding(len(scene.wh), cfg.appearance_dim)
         nn.init.normal_(self.appearance.weight, std=0.01)
-        self.views = {}  # by photo
+        self.has_mask = cfg.mask != "off"
+        if self.has_mask:
+            self.mask = geonvs.TransientMask(scene)
 
     def groups(self):
-        parts = [
-            [self.center],
-            [self.log_size],
-            [self.turn],
-            [self.opacity],
-            [self.feature],
-            list(self.paint.parameters()),
-            [self.appearance.weight]]
-        rates = (2e-3, 5e-2, 2e-2, 5e-2, 2e-2, 2e-3, self.cfg.lr_code)
-        return [
-            dict(params=part, base_lr=rate, **self.adam)
-            for part, rate in zip(parts, rates)]
+        rates = [
+            (self.center, 2e-3),
+            (self.log_size, 5e-2),
+            (self.turn, 2e-2),
+            (self.opacity, 5e-2),
+            (self.feature, 2e-2),
+            (self.appearance.weight, self.cfg.lr_code)]
+        rates += [(value, 2e-3) for value in self.paint.parameters()]
+        if self.has_mask:
+            rates += [(value, self.cfg.lr_mask) for value in self.mask.parameters()]
+        return [dict(params=[value], base_lr=rate, **self.adam) for value, rate in rates]
+
+    def batch(self, n, gen):
+        """A square grid of n rays over a random window of one photo, tile by tile."""
+        photos = self.scene.train
+        picked = photos[geonvs.random_index(gen, len(photos), 1)]
+        size = 0.5 + 0.5 * geonvs.uniform(gen, 1)
+        corner = geonvs.uniform(gen, 2) * (1 - size)
+        axis = torch.linspace(0, 1, math.isqrt(n), device=gen.device).view(-1, TILE)
+        row, col = torch.broadcast_tensors(axis[:, None, :, None], axis[:, None])
+        uv = torch.stack([col, row], 4).view(-1, 2) * size + corner  # (R,2)
+        wh = self.scene.wh[picked]  # (1,2)
+        xy = (uv * (wh - 1)).round().long()  # (R,2)
+        pixel = xy[:, 1] * wh[:, 0] + xy[:, 0]
+        rays = geonvs.make_rays(self.scene, picked.expand_as(pixel), pixel)
+        return rays, picked
 
     def render(self, rays, code):
-        """rgb (R,3); the rays of each photo at once, under the code of the first of them. The
-        geometry has no gradient here and is kept until the next step of training."""
+        """The rays of each photo at once, under the code of the first of them. The geometry has no
+        gradient here."""
         rgb = torch.zeros_like(rays.rgb)
         for photo in rays.img.unique().tolist():
-            if photo not in self.views:
-                with torch.no_grad():
-                    self.views[photo] = self.view(photo)
+            with torch.no_grad():
+                view = self.view(photo)
             mine = rays.img == photo  # (R,)
-            xy = rays.uv[mine] * self.scene.wh[photo]  # px
-            rgb[mine], _ = self.draw(self.views[photo], code[mine][0], xy)
+            xy = rays.uv[mine, None] * self.scene.wh[photo]  # (R,1,2) px, each ray a tile
+            picture, _ = self.draw(view, code[mine][0], xy)
+            rgb[mine] = picture[:, 0]
         return dict(rgb=rgb, normal=torch.zeros_like(rgb), depth=torch.zeros_like(rgb[:, 0]))
 
     def view(self, photo):
@@ -3773,8 +3640,8 @@ class PlainSplats(Rival):
         return order, center, cov, x.detach().norm(dim=1, keepdim=True)
 
     def draw(self, view, code, xy):
-        """Colours (R,3) of pixels xy (R,2) of a view under a code (A,), and mean distance (R,1) of
-        what is seen."""
+        """Colours (B,P,3) of pixels xy (B,P,2) of a view under a code (A,), and mean distance
+        (B,P,1) of what is seen."""
         order, center, cov, distance = view
         feature = torch.cat([self.feature[order], self.feature[-1:]])  # (N+1,F)
         codes = code.expand(len(feature), -1)
@@ -3783,307 +3650,174 @@ class PlainSplats(Rival):
         opacity = self.opacity[order].sigmoid()
         columns = torch.cat([rgb[:-1], distance], 1)  # (N,4)
         picture, trans = splat(center, cov, opacity, columns, xy)
-        rgb = picture[:, :3] + trans[:, None] * rgb[-1]
-        seen = (1 - trans[:, None]).clamp_min(1e-3)
-        return rgb, (picture[:, 3:] / seen).detach()
+        trans = trans[..., None]
+        distance = picture[..., 3:] / (1 - trans).clamp_min(1e-3)
+        return picture[..., :3] + trans * rgb[-1], distance.detach()
 
     def losses(self, rays, photos, done, gen):
         """Mean absolute error of rays of one photo, weighted by what the mask leaves."""
-        self.views.clear()
         photo = photos.item()
         xy = rays.uv * self.scene.wh[photo]  # px
-        code = self.appearance.weight[photo]
-        rgb, distance = self.draw(self.view(photo), code, xy)
+        tiles = xy.view(-1, TILE**2, 2)
+        rgb, distance = self.draw(self.view(photo), self.appearance.weight[photo], tiles)
+        rgb = rgb.flatten(0, 1)  # (R,3)
+        distance = distance.flatten(0, 1)  # (R,1)
         residual = (rgb - rays.rgb).abs()
-        mask, reg = self.transients(rays, photos, done, residual.detach().amax(1), distance)
-        loss = ((1 - mask) * residual.mean(1)).mean()
+        left_out, reg = self.transients(rays, photos, residual.detach().amax(1), distance, done)
+        loss = ((1 - left_out) * residual.mean(1)).mean()
         mse = residual.detach().square().mean()
         return loss + reg, dict(rgb=loss, reg=reg, mse=mse), {}
 
-    def transients(self, rays, photos, done, error, distance):
-        """Mask (R,) and its loss: none here."""
-        return torch.zeros_like(error), error.new_zeros(())
-
-
-class Splats(PlainSplats):
-    """Splats with this project's transient mask, as splats in the wild have one."""
-    name = "splats"
-
-    def make_parts(self, cfg, scene):
-        super().make_parts(cfg, scene)
-        self.cfg.mask = "on"
-        self.mask = geonvs.TransientMask(scene)
-
-    def groups(self):
-        mask = dict(params=list(self.mask.parameters()), base_lr=self.cfg.lr_mask, **self.adam)
-        return [*super().groups(), mask]
-
-    def transients(self, rays, photos, done, error, distance):
-        """As in GeoNVS.losses, without GPL, by the threshold at the mean place that is seen."""
-        logit = geonvs.sample_logits(self.mask.logits(photos), rays.uv)  # (R,)
-        if done >= geonvs.MASK_TRAINING:
-            logit = logit.detach()
+    def transients(self, rays, photos, error, distance, done):
+        """What the loss leaves out (R,), and L_reg: GeoNVS.transients, without complexity, at the
+        places at distance (R,1)."""
+        none = torch.zeros_like(error)
+        if not self.has_mask:
+            return none, none.sum()
         place = geonvs.contract(rays.at(distance)[:, 0])  # (R,3)
-        excess = error * ~rays.has_sfm - self.mask.threshold(place)
-        cell = geonvs.place_cell(place)
-        every = torch.ones_like(excess, dtype=torch.bool)
-        geonvs.update_running_quantiles(
-            self.mask.place_error, geonvs.PLACE_QUANTILE, cell, error, every)
-        mask = geonvs.reject_outliers(logit.sigmoid().detach(), excess > 0, done)
-        return mask, geonvs.mask_loss(logit, excess)
+        out = dict(ray_e_grad=none, ray_e_curv=none, opacity=none, is_solid=none > 0, place=place)
+        left_out, reg, _, out["complexity"] = self.mask_rays(rays, photos, out, error, done)
+        self.mask.update_quantiles(rays, out, error)
+        return left_out, reg
 
 
-# ---- What rows replace: the paper's or a plainer form of a piece ---------------------------------
+# ---- Other forms of the method -------------------------------------------------------------------
 
-seed_octree = geonvs.seed_octree  # the method's own, while a row replaces it
-
-
-def flat_phi(complexity, opacity, quantiles):
-    """Phi is one half on every ray: a penalty on the mask that is blind to edges."""
-    return torch.full_like(complexity, 0.5)
-
-
-def paper_phi(complexity, opacity, quantiles):
-    """Eq. 4 with a plain sigmoid, not calibrated: above 0.5 on every ray."""
-    return torch.sigmoid(complexity)
-
-
-def paper_alpha(sdf, zeta):
-    """Eq. 1: sigmoid(zeta s_i + beta_i) - sigmoid(zeta s_{i+1} + beta_i), where beta_i, half of the
-    slope times the length of the interval, is half of the change of s. Not negative."""
-    beta = sdf.diff() / 2  # (R,S)
-    before = torch.sigmoid(zeta * sdf[:, :-1] + beta)
-    after = torch.sigmoid(zeta * sdf[:, 1:] + beta)
-    return (before - after).clamp_min(0)
-
-
-def paper_mask_loss(logit, excess):
-    """-M error, from L_rgb with a gradient to M, and penalties for intensity and bimodality, whose
-    weights the paper leaves open. The threshold is 0 in this row: excess is the error."""
-    M = logit.sigmoid()
-    return (0.15 * M**2 + 0.02 * M * (1 - M) - M * excess).mean()
-
-
-def paper_lipschitz_loss(network):
-    """The product of the layers' bounds, with Permuto-SDF's weight, over that of the log form."""
-    return 3e-6 / 1e-5 * torch.exp(sum(layer.c for layer in network[::2]))
-
-
-def keep_outliers(mask, is_outlier, done):
-    """M as the network says."""
-    return mask
-
-
-def even_samples(edges, weight, u):
-    """inverse_cdf of a constant weight."""
-    return torch.lerp(edges[:, :1], edges[:, -1:], u)
-
-
-class NoThreshold(geonvs.TransientMask):
-    """Any error counts."""
-    def threshold(self, place):
-        return torch.zeros_like(place[:, 0])
-
-
-class FreeZeta(geonvs.GeoNVS):
-    """zeta without a floor."""
-    def before_step(self, step, done):
-        learned = self.deviation.detach().clone()
-        super().before_step(step, done)
-        self.deviation.data.copy_(torch.minimum(self.deviation, learned))
-
-
-class NoNormal(geonvs.GeoNVS):
-    """Its colour network sees zeros instead of normals."""
-    def __init__(self, cfg, scene):
-        super().__init__(cfg, scene)
-        self.color.register_forward_pre_hook(self.hide_normal)
-
-    def hide_normal(self, _, inputs):
-        x = inputs[0].clone()
-        begin = geonvs.GEOMETRY_FEATURES + self.sdf.octree.width
-        x[..., begin:begin + 3] = 0
-        return x
-
-
-class Density(NoNormal):
+class Density(geonvs.GeoNVS):
     """An octree NeRF-W: the field is a density exp(-10 s) instead of a distance."""
     name = "density"
 
-    def alpha(self, sdf, t, max_zeta=math.inf):
+    def sample(self, rays, t0, t1, jitter):
+        """GeoNVS.sample with this density. Lengths are remembered for alpha: first those between
+        the probes of the cache, then those between the samples."""
+        self.length = (t1 - t0) / geonvs.PROBES  # (R,1)
+        t = super().sample(rays, t0, t1, jitter)  # (R,S+1)
+        self.length = t.diff()  # (R,S)
+        return t
+
+    def alpha(self, sdf, max_zeta=math.inf):
         mean = (sdf[:, :-1] + sdf[:, 1:]) / 2  # (R,S)
         sigma = torch.exp(-10 * mean.clamp(-2, 2))
-        return 1 - torch.exp(-sigma * t.diff())
+        return 1 - torch.exp(-sigma * self.length)
 
 
-def dense_octree(octree, points, dense):
-    """The foreground (half = 1) as a uniform grid: every cell is split down to the last level."""
-    if octree.half == 1:
-        dense = octree.levels - 1
-        points = points[:0]
-    seed_octree(octree, points, dense)
+class UniformGrid(geonvs.GeoNVS):
+    """Every cell of the foreground is split, down to the last level."""
+    name = "uniform grid"
 
+    def __init__(self, cfg, scene):
+        super().__init__(cfg, scene)
+        octree = self.sdf.octree
+        for _ in range(octree.levels - 1):
+            octree.split(octree.cells)
+        nn.init.normal_(octree.features, std=0.01)
+        self.cache.refresh(self.distance)
 
-def no_cells(octree):
-    """No refinement."""
-    return octree.cells[:0]
+    def refine(self, *_):
+        """There is nothing left to split."""
 
 
 # ---- Experiments and their rows ------------------------------------------------------------------
 
 class Row(NamedTuple):
-    """One run of an experiment, but for its seed."""
+    """One training of an experiment, but for its seed."""
     settings: dict = {}  # of Config
-    replaced: dict = {}  # of geonvs, by name, during the run
     kind: type = geonvs.GeoNVS
-    toy: dict = None  # knobs of data_prep.make_toy
-    seeds: int = 99  # at most
+    toy: dict = {}  # knobs of data_prep.make_toy; none: the scene that flags name
 
 
+BUDGETS = dict(  # unless --steps or --minutes is given
+    parts=dict(steps=1500),
+    chart=dict(minutes=1.0),
+    grid=dict(steps=1500),
+    stress=dict(minutes=0.5))
 NO_GEOMETRY = dict(lam_eik=0.0, lam_curv=0.0, lam_sfm=0.0, lam_off=0.0, lam_gpl=0.0)
-PAPER_MASK = dict(
-    TransientMask=NoThreshold,
-    mask_loss=paper_mask_loss,
-    reject_outliers=keep_outliers)
-PAPER = {  # its equations as printed; the mask, GPL and the SDF
-    "full": Row(),
+SMALL = dict(rays=384, hidden=32, lr_net=1e-2, lr_grid=3e-2)  # for budgets under a minute
+SPLATS = dict(rays=1024, photos=1, hidden=64)
+NERFW = dict(rays=256, photos=256, samples=16, hidden=64, lr_net=5e-3)
+METHODS = {  # of chart
+    "Geo-NVS-w": Row(),
+    "Geo-NVS-w, small": Row(SMALL),
+    "density": Row(NO_GEOMETRY, Density),
+    "splats": Row(SPLATS, Splats),
+    "splats, no mask": Row(SPLATS | dict(mask="off"), Splats),
+    "NeRF-W": Row(NERFW, NeRFW)}
+PARTS = {
+    "Geo-NVS-w": Row(),
+    **{f"{name} as printed": Row(dict(paper=name)) for name in geonvs.PRINTED},
+    "all as printed": Row(dict(paper=",".join(geonvs.PRINTED))),
+    "no L_off": Row(dict(lam_off=0.0)),
+    "no L_sfm": Row(dict(lam_sfm=0.0)),
+    "no L_eik": Row(dict(lam_eik=0.0)),
+    "no L_curv": Row(dict(lam_curv=0.0)),
+    "no L_lps": Row(dict(lam_lps=0.0)),
     "GPL off": Row(dict(lam_gpl=0.0)),
-    "GPL flat Phi": Row(replaced=dict(edge_indicator=flat_phi)),
     "GPL ten times": Row(dict(lam_gpl=0.5)),
-    "paper Eq. 1": Row(replaced=dict(neus_alpha=paper_alpha)),
-    "paper Eq. 4": Row(replaced=dict(edge_indicator=paper_phi)),
-    "paper L_reg": Row(replaced=PAPER_MASK),
-    "paper L_lps": Row(replaced=dict(lipschitz_loss=paper_lipschitz_loss)),
-    "as in the paper": Row(
-        kind=FreeZeta,
-        replaced=PAPER_MASK | dict(
-            neus_alpha=paper_alpha,
-            edge_indicator=paper_phi,
-            lipschitz_loss=paper_lipschitz_loss)),
-    "density": Row(NO_GEOMETRY, kind=Density),
     "no mask": Row(dict(mask="off")),
-    "no threshold by place": Row(replaced=dict(PLACE_FACTOR=0.0)),
-    "outliers kept": Row(replaced=dict(reject_outliers=keep_outliers))}
-PIECES = {
-    "full": Row(),
-    "no SfM term": Row(dict(lam_sfm=0.0)),
-    "no air": Row(dict(lam_off=0.0)),
-    "no eikonal": Row(dict(lam_eik=0.0)),
-    "no curvature": Row(dict(lam_curv=0.0)),
-    "no appearance": Row(dict(appearance="off")),
+    "no codes": Row(dict(appearance="off")),
     "no background": Row(dict(background="off")),
-    "no Lipschitz": Row(dict(lam_lps=0.0)),
-    "no normal": Row(kind=NoNormal),
-    "uniform sampling": Row(replaced=dict(inverse_cdf=even_samples)),
-    "no uniform share": Row(replaced=dict(UNIFORM_SHARE=0.0)),
-    "no floor of zeta": Row(kind=FreeZeta)}
-GRID = {
-    "octree": Row(),
-    "uniform grid": Row(replaced=dict(seed_octree=dense_octree, cells_to_split=no_cells))}
-STRESS = {  # knobs of the toy, the row of PAPER or PIECES that is made for them, seeds
-    "easy": (dict(photos=48, occluders=0.04, exposure=0.5), "no mask", 1),
-    "middle": (dict(photos=32, occluders=0.15, exposure=1.0, pose_noise=0.5), "GPL off", 1),
-    "hard": (dict(photos=24, occluders=0.25, exposure=2.0, pose_noise=1.0), "no SfM term", 3),
-    "crowd": (dict(photos=24, occluders=0.4), "no mask", 3),
-    "lights": (dict(photos=24, exposure=2.0), "no appearance", 1),
-    "sun": (dict(photos=24, sun=60.0), "no normal", 1),
-    "sky": (dict(photos=24, sky=1.0), "no threshold by place", 3),
-    "facade": (dict(photos=10, landmark=-1), "no air", 3),
-    "few photos": (dict(photos=8), "no SfM term", 3),
-    "wrong poses": (dict(photos=24, pose_noise=3.0), "no curvature", 3),
-    "other building": (dict(photos=24, landmark=3), "no curvature", 1)}
-WIDE = dict(rays=1024, samples=64, hidden=256, lr_net=5e-4)
-LEAN = dict(rays=384, hidden=32, lr_net=1e-2, lr_grid=3e-2)
-SMALL = {  # methods of chart and stress, as tuned on a toy and a theatre for a minute: see RESULTS
-    "geonvsw": Row(LEAN),
-    "geonvsw, defaults": Row(),
-    "density": Row(LEAN | NO_GEOMETRY, kind=Density),
-    "splats": Row(SPLATS, kind=Splats),
-    "splats, no mask": Row(SPLATS, kind=PlainSplats),
-    "nerfw": Row(
-        dict(rays=256, photos=256, samples=16, hidden=64, lr_net=5e-3),
-        kind=NeRFW),
-    "hanerf": Row(
-        dict(rays=256, photos=1, samples=16, hidden=64, lr_net=4e-3),
-        kind=HaNeRF)}
-PUBLISHED = SMALL | {
-    "geonvsw": Row(),
-    "density": Row(NO_GEOMETRY, kind=Density),
-    "nerfw": Row(WIDE | dict(photos=1024), kind=NeRFW),
-    "hanerf": Row(WIDE | dict(photos=1), kind=HaNeRF)}
-IN_STRESS = ("density", "splats", "nerfw", "hanerf")
-IN_CHART = ("geonvsw", "geonvsw, defaults", "density", "splats", "splats, no mask", "nerfw")
-COSTS = {"train_seconds": "training, s", "energy_wh": "energy, Wh"}
-FIGURES = (
-    "psnr", "psnr_floor", "ssim", "sdf_error", "normal_error", "mask_iou", "mask_static",
-    "mask_edges", "mask_flat", "mask_sky", "steps", "train_seconds", "energy_wh",
-    "rays_per_second", "model_bytes", "parameters")
+    "density": METHODS["density"]}
+GRID = {"octree": Row(), "uniform grid": Row(kind=UniformGrid)}
+STRESS = {  # knobs of a toy, and the row of PARTS without what is made for it
+    "hard": (dict(photos=24, occluders=0.25, exposure=2.0, pose_noise=1.0), "no L_sfm"),
+    "crowd": (dict(photos=24, occluders=0.4), "no mask"),
+    "lights": (dict(photos=24, exposure=2.0), "no codes"),
+    "sky": (dict(photos=24, sky=1.0), "reg as printed"),
+    "facade": (dict(photos=10, landmark=-1), "no L_off"),
+    "few photos": (dict(photos=8), "no L_sfm"),
+    "wrong poses": (dict(photos=24, pose_noise=3.0), "no L_curv")}
 
 
-def chart_rows(given, methods):
+def chart_rows(given):
     """Every method in turn with a quarter of the budget, the budget, and four times as much."""
-    unit = "steps" if "steps" in given else "minutes"
-    whole = given.get(unit, 1.0)
+    unit = "minutes" if given.get("minutes") else "steps"
     rows = {}
-    for share in (1 / 4, 1, 4):
-        budget = max(1, int(share * whole)) if unit == "steps" else share * whole
-        for title in IN_CHART:
-            row = methods[title]
+    for share in (0.25, 1, 4):
+        budget = type(given[unit])(share * given[unit])  # steps are whole numbers
+        for title, row in METHODS.items():
             rows[f"{title} x{share:g}"] = row._replace(settings=row.settings | {unit: budget})
     return rows
 
 
-def stress_rows(given, methods):
-    """In every cell: the method, without the piece that is made for the cell, and its rivals."""
-    budget = {} if {"steps", "minutes"} & set(given) else dict(minutes=1.5)
+def stress_rows():
+    """On every toy: the method, small; the same without what is made for the toy; its rivals."""
     rows = {}
-    for cell, (toy, piece, seeds) in STRESS.items():
-        own = methods["geonvsw"].settings
-        here = {}
-        for how in ("full", piece):
-            row = (PAPER | PIECES)[how]
-            here[how] = row._replace(settings=own | row.settings)
-        here |= {title: methods[title] for title in IN_STRESS}
-        for title, row in here.items():
-            settings = budget | row.settings
-            rows[f"{cell}: {title}"] = row._replace(settings=settings, toy=toy, seeds=seeds)
+    for cell, (toy, part) in STRESS.items():
+        rows |= {
+            f"{cell}: Geo-NVS-w, small": Row(SMALL, toy=toy),
+            f"{cell}: {part}": Row(SMALL | PARTS[part].settings, toy=toy),
+            f"{cell}: density": Row(SMALL | NO_GEOMETRY, Density, toy),
+            f"{cell}: splats": Row(SPLATS, Splats, toy)}
     return rows
 
 
-@functools.cache
-def stress_scene(**knobs):
-    """The rows of a cell share it."""
-    return data_prep.make_toy(**knobs)
+make_toy_once = functools.cache(data_prep.make_toy)
 
 
 def run_row(run, given, row):
-    """Metrics of one training, read if there are some of the same settings; one that diverged is a
-    result, too."""
+    """Metrics of one training. They are read if the run is there with the same settings; a
+    training that diverged is a result, too."""
     cfg = geonvs.make_config(given | row.settings)
-    if row.toy:
-        arrays = stress_scene(**row.toy)
-    else:
-        arrays = data_prep.open_scene(cfg.source, cfg.downscale)
-    data_prep.check(arrays["is_test"].any(), "experiments need held-out photos: see README")
-    key = dict(
-        config=asdict(cfg),
-        toy=row.toy,
-        replaced={name: getattr(v, "__name__", v) for name, v in row.replaced.items()},
-        method=row.kind.__name__)
+    key = dict(config=asdict(cfg), toy=row.toy, method=row.kind.name)
     path = run / "row.json"
     saved = json.loads(path.read_text()) if path.exists() else {}
     if saved.get("key") != key:
-        saved = dict(key=key, metrics=train_row(cfg, arrays, run, row))
+        if row.toy:
+            arrays = make_toy_once(**row.toy)
+        else:
+            arrays = data_prep.open_scene(cfg.source, cfg.downscale)
+        data_prep.check(arrays["is_test"].any(), "experiments need held-out photos: see README")
+        saved = dict(key=key, metrics=train_row(cfg, arrays, run, row.kind))
         data_prep.atomic_write(path, lambda part: part.write_text(json.dumps(saved)))
     metrics = saved["metrics"]
-    result = metrics.get("failed") or "{psnr:.2f} dB, {train_seconds:.0f} s".format(**metrics)
+    result = metrics.get("failed") or f"{metrics['psnr']:.2f} dB"
     print(f"{run}: {result}", flush=True)
     return metrics
 
 
-def train_row(cfg, arrays, run, row):
-    """Trains and scores, with what the row replaces; writes log.txt below run. One thread on a CPU
-    is timed by its work, as experiments may share a machine."""
+def train_row(cfg, arrays, run, kind):
+    """Trains and scores a model of a class; writes log.txt below run. One thread on a CPU is timed
+    by its work, as experiments may share a machine."""
     shutil.rmtree(run, ignore_errors=True)  # what was cut off begins anew
     run.mkdir(parents=True)
     device = geonvs.pick_device(cfg.device)
@@ -4091,7 +3825,7 @@ def train_row(cfg, arrays, run, row):
     is_one_thread = device.type == "cpu" and torch.get_num_threads() == 1
     clock = time.process_time if is_one_thread else time.perf_counter
     timed = mock.patch.object(time, "perf_counter", clock)
-    replaced = mock.patch.dict(vars(geonvs), row.replaced, GeoNVS=row.kind)
+    replaced = mock.patch.object(geonvs, "GeoNVS", kind)
     with timed, replaced, open(run / "log.txt", "w") as log, contextlib.redirect_stdout(log):
         try:
             model, state = geonvs.train(cfg, scene, run)
@@ -4102,46 +3836,61 @@ def train_row(cfg, arrays, run, row):
             return dict(failed=str(error))
 
 
+def experiment(argv):
+    """Trains every row of an experiment with every seed; writes its table and prints it."""
+    parser = geonvs.make_parser()
+    parser.add_argument("experiment", choices=(*BUDGETS, "draw"))
+    parser.add_argument("--seeds", type=int, default=3, help="seeds of every row [3]")
+    given = vars(parser.parse_args(argv))
+    name = given.pop("experiment")
+    seeds = given.pop("seeds")
+    data_prep.check(seeds > 0, "--seeds: use a number from 1")
+    is_plain = not (given.pop("resume") or given.pop("render"))
+    data_prep.check(is_plain, "an experiment goes on by itself: no --resume, no --render")
+    if name == "draw":
+        draw()
+        return
+    if not (given.get("steps") or given.get("minutes")):
+        given |= BUDGETS[name]
+    rows = dict(
+        parts=PARTS,
+        chart=chart_rows(given),
+        grid=GRID,
+        stress=stress_rows())[name]
+    source = geonvs.make_config(given).source
+    where = Path("runs", f"{name}-{data_prep.scene_path(source).stem}")
+    results = defaultdict(list)
+    for seed in range(seeds):
+        for title, row in rows.items():
+            folder = re.sub(r"[^\w.]+", "-", f"{title} {seed}")
+            results[title].append(run_row(where / folder, given | dict(seed=seed), row))
+    table = [summary(title, runs) for title, runs in results.items()]
+    write_table(Path(f"{name}.csv"), table)
+    print(markdown(table))
+
+
 # ---- Tables and figures --------------------------------------------------------------------------
 
-def summary(name, runs):
-    """Mean and standard deviation over seeds, None if not measured. A failure has diverged or is
-    below the baseline."""
-    failed = ["failed" in run or run["psnr"] < run["psnr_floor"] for run in runs]
-    line = dict(row=name, runs=len(runs), failures=sum(failed))
-    for key in FIGURES:
+METRICS = (
+    "psnr", "psnr_floor", "ssim", "sdf_error", "normal_error", "mask_iou", "mask_edges",
+    "mask_flat", "mask_sky", "steps", "train_seconds", "energy_wh", "model_bytes")
+COLUMNS = dict(  # of the printed table: title, digits after the point
+    psnr=("PSNR, dB", 2),
+    ssim=("SSIM", 3),
+    sdf_error=("SDF error", 4),
+    normal_error=("normals, degrees", 1),
+    mask_iou=("IoU", 2))
+
+
+def summary(title, runs):
+    """A line of a table: means and standard deviations over seeds, None if not measured. Trainings
+    that failed have diverged."""
+    line = dict(row=title, runs=len(runs), failures=sum("failed" in run for run in runs))
+    for key in METRICS:
         values = [run[key] for run in runs if run.get(key) is not None]
         line[key] = float(np.mean(values)) if values else None
-        line[key + "_std"] = float(np.std(values, ddof=1)) if len(values) > 1 else None
+        line[f"{key}_std"] = float(np.std(values, ddof=1)) if len(values) > 1 else None
     return line
-
-
-def method_of(line):
-    return line["row"].split(" x")[0]
-
-
-def time_to(lines, level, unit):
-    """Seconds or watt-hours at which whole runs reach a PSNR, log-interpolated between budgets, or
-    None."""
-    points = [(line[unit], line["psnr"]) for line in lines if line[unit] and line["psnr"]]
-    points.sort()
-    before = points[:1] + points
-    for (x0, y0), (x1, y1) in zip(before, points):
-        if y1 >= level:
-            share = max(0.0, (level - y0) / (y1 - y0)) if y1 > y0 else 1.0
-            return x0 * (x1 / x0) ** share
-    return None
-
-
-def add_times(table):
-    """Adds to a chart's lines at what cost their method reaches the best of each method."""
-    methods = dict.fromkeys(map(method_of, table))
-    curves = {method: [line for line in table if method_of(line) == method] for method in methods}
-    for method, curve in curves.items():
-        best = max((line["psnr"] for line in curve if line["psnr"]), default=math.inf)
-        for line in table:
-            for unit in COSTS:
-                line[f"{unit}_to_{method}"] = time_to(curves[method_of(line)], best, unit)
 
 
 def write_table(path, table):
@@ -4149,163 +3898,121 @@ def write_table(path, table):
     writer = csv.DictWriter(text, table[0], lineterminator="\n")
     writer.writeheader()
     for line in table:
-        rounded = {k: f"{v:.5g}" if isinstance(v, float) else v for k, v in line.items()}
-        writer.writerow(rounded)
+        writer.writerow(
+            {k: f"{v:.5g}" if isinstance(v, float) else v for k, v in line.items()})
     data_prep.atomic_write(path, lambda part: part.write_text(text.getvalue()))
 
 
-def draw_chart(table):
-    """PSNR over what it cost, a curve a method; the first is thick, as others may hide it."""
-    from matplotlib import figure as figures
-    costs = [unit for unit in COSTS if any(line[unit] for line in table)]
-    methods = list(dict.fromkeys(map(method_of, table)))
-    figure = figures.Figure(figsize=(7.5 * len(costs), 4), layout="constrained")
-    for axis, unit in zip(figure.subplots(1, len(costs), squeeze=False)[0], costs):
-        axis.axhline(table[0]["psnr_floor"], color="grey", label="baseline")
-        axis.set(xscale="log", xlabel=COSTS[unit], ylabel="PSNR of held-out right halves, dB")
-        for method in methods:
-            mine = [line for line in table if method_of(line) == method and line["psnr"]]
-            cost = [line[unit] for line in mine]
-            psnr = [line["psnr"] for line in mine]
-            spread = [line["psnr_std"] or 0 for line in mine]
-            width = 5 if method == methods[0] else 1.5
-            axis.errorbar(cost, psnr, spread, marker="o", capsize=3, lw=width, label=method)
-            if method == methods[0]:
-                plain = functools.partial(np.format_float_positional, fractional=False, trim="-")
-                axis.set_xticks(cost, [plain(x, 2) for x in cost])
-        axis.minorticks_off()
-        axis.legend(loc="center left", bbox_to_anchor=(1, 0.5))
-    return figure
+def read_table(path):
+    """The lines of a table that have a PSNR; what was not measured is nan."""
+    with open(path) as file:
+        lines = [line for line in csv.DictReader(file) if line["psnr"]]
+    return [
+        {k: v if k == "row" else float(v or "nan") for k, v in line.items()}
+        for line in lines]
 
 
-def draw_bars(table):
-    """What each row gains over the first row, the best one last."""
-    from matplotlib import figure as figures
-    rows = [line for line in table if line["psnr"]]
-    rows.sort(key=lambda line: line["psnr"])
-    figure = figures.Figure(figsize=(7.5, 1 + 0.25 * len(rows)), layout="constrained")
-    axis = figure.subplots()
-    for place, line in enumerate(rows):
-        gain = line["psnr"] - table[0]["psnr"]
-        axis.barh(place, gain, xerr=line["psnr_std"] or 0, capsize=3, color="C0")
-    axis.set_yticks(range(len(rows)), [line["row"] for line in rows])
-    axis.invert_yaxis()
-    axis.axvline(0, color="grey", lw=1)
-    axis.set_xlabel(f"PSNR above that of {table[0]['row']} ({table[0]['psnr']:.2f}), dB")
-    return figure
-
-
-def draw_cells(table):
-    """PSNR above the baseline in each cell of `stress`, a marker for each method. A cell's name has
-    in brackets what is changed in the method for the marker "as in brackets"."""
-    from matplotlib import figure as figures
-    places = {cell: place for place, cell in enumerate(STRESS)}
-    figure = figures.Figure(figsize=(9, 1 + 0.4 * len(places)), layout="constrained")
-    axis = figure.subplots()
-    colours = dict(full="C0", nerfw="C1", hanerf="C2", splats="C3", density="C4")
+def markdown(table):
+    """The table as text: mean ± standard deviation. A column without numbers is left out."""
+    keys = [key for key in COLUMNS if any(line[key] is not None for line in table)]
+    rows = [["row", *[COLUMNS[key][0] for key in keys]], ["---"] * (1 + len(keys))]
     for line in table:
-        cell, method = line["row"].split(": ")
-        if not line["psnr"]:  # it diverged
-            continue
-        gain = line["psnr"] - line["psnr_floor"]
-        spread = line["psnr_std"] or 0
-        label = method if method in colours else "as in brackets"
-        colour = colours.get(method, "C9")
-        size = 9 if method == "full" else 6
+        failed = f" ({line['failures']} of {line['runs']} failed)" if line["failures"] else ""
+        cells = [line["row"] + failed]
+        for key in keys:
+            _, digits = COLUMNS[key]
+            numbers = [line[key], line[f"{key}_std"]]
+            cells.append(" ± ".join(f"{x:.{digits}f}" for x in numbers if x is not None) or "–")
+        rows.append(cells)
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in rows)
+
+
+def draw():
+    """Draws chart.png: a panel for each chart*.csv of this folder."""
+    from matplotlib.figure import Figure
+    paths = sorted(Path().glob("chart*.csv"))
+    data_prep.check(paths, "there is no chart*.csv here: run the experiment chart")
+    high = math.ceil(len(paths) / 2)
+    figure = Figure(figsize=(13, 4.2 * high), layout="constrained")
+    for number, path in enumerate(paths):
+        axis = figure.add_subplot(high, 2, number + 1, title=path.stem)
+        draw_chart(axis, read_table(path))
+    data_prep.atomic_write(Path("chart.png"), lambda part: figure.savefig(part, dpi=110))
+    print("wrote chart.png")
+
+
+def spread_out(values, gap):
+    """Numbers (N,) moved apart in their order, so that neighbours are at least gap apart: the mean
+    of moving them only up and moving them only down."""
+    order = np.argsort(values)
+    even = gap * np.arange(len(values))
+    free = np.asarray(values)[order] - even
+    up = np.maximum.accumulate(free)
+    down = np.minimum.accumulate(free[::-1])[::-1]
+    moved = np.empty(len(values))
+    moved[order] = (up + down) / 2 + even
+    return moved
+
+
+def draw_chart(axis, table):
+    """PSNR over training time: a line a method, and the baseline, with their names at the right. At
+    a budget the methods stand side by side, so that none hides another."""
+    curves = defaultdict(list)
+    for line in table:
+        method, _ = line["row"].split(" x")
+        curves[method].append(line)
+    budgets = [line["train_seconds"] for line in list(curves.values())[0]]
+    axis.set(xscale="log", xlabel="training, s", ylabel="PSNR, dB")
+    axis.set_xticks(budgets, [f"{seconds:.0f}" for seconds in budgets])
+    axis.minorticks_off()
+    floor = table[0]["psnr_floor"]
+    axis.axhline(floor, color="grey", ls=":")
+    ends = [("baseline", budgets[-1], floor, "grey")]
+    for number, (method, curve) in enumerate(curves.items()):
+        aside = 1.06 ** (number - len(curves) / 2)
+        seconds = [aside * line["train_seconds"] for line in curve]
+        psnr = [line["psnr"] for line in curve]
+        spread = [line["psnr_std"] for line in curve]
         axis.errorbar(
-            gain, places[cell], xerr=spread, fmt="o", capsize=3,
-            color=colour, markersize=size, label=label)
-    axis.set_yticks(range(len(places)), [f"{cell} ({STRESS[cell][1]})" for cell in places])
-    axis.invert_yaxis()
-    axis.grid(axis="y", alpha=0.5)
-    axis.axvline(0, color="grey", lw=1)
-    axis.set_xlabel("PSNR above the baseline, dB")
-    handles, labels = axis.get_legend_handles_labels()
-    handle_of = dict(zip(labels, handles))  # each label once
-    axis.legend(handle_of.values(), handle_of, loc="center left", bbox_to_anchor=(1, 0.5))
-    return figure
-
-
-def experiment(argv):
-    """Runs every row of an experiment, writes its table and its figure."""
-    has_matplotlib = importlib.util.find_spec("matplotlib")
-    data_prep.check(has_matplotlib, "charts need matplotlib: pip install matplotlib")
-    parser = geonvs.make_parser()
-    parser.add_argument("experiment", choices=("chart", "paper", "pieces", "grid", "stress"))
-    parser.add_argument("--seeds", type=int, default=3, help="seeds of every row [3]")
-    parser.add_argument("--published", action="store_true", help="rivals at published size")
-    given = vars(parser.parse_args(argv))
-    name = given.pop("experiment")
-    seeds = given.pop("seeds")
-    methods = PUBLISHED if given.pop("published") else SMALL
-    data_prep.check(seeds > 0, "--seeds: use a number from 1")
-    is_plain = not (given.pop("resume") or given.pop("render"))
-    data_prep.check(is_plain, "an experiment goes on by itself: no --resume, no --render")
-    rows = dict(
-        chart=chart_rows(given, methods),
-        paper=PAPER,
-        pieces=PIECES,
-        grid=GRID,
-        stress=stress_rows(given, methods))[name]
-    source = geonvs.make_config(given).source
-    where = Path("runs", f"{name}-{data_prep.scene_path(source).stem}")
-    results = defaultdict(list)
-    for seed in range(seeds):
-        for title, row in rows.items():
-            folder = title.replace(" ", "_").replace(":", "")
-            if seed < row.seeds:
-                run = where / f"{folder}-{seed}"
-                results[title].append(run_row(run, given | dict(seed=seed), row))
-    table = [summary(title, runs) for title, runs in results.items()]
-    has_base = table[0]["psnr"] is not None
-    data_prep.check(has_base, f"the first row of {name} has failed: see log.txt of runs in {where}")
-    if name == "chart":
-        add_times(table)
-    draw = dict(chart=draw_chart, stress=draw_cells).get(name, draw_bars)
-    figure = draw(table)
-    write_table(Path(f"{name}.csv"), table)
-    scene = f"{len(STRESS)} toys" if name == "stress" else Path(source).name
-    figure.suptitle(f"{scene}; bars: standard deviation of {seeds} seeds", fontsize=9)
-    data_prep.atomic_write(Path(f"{name}.png"), lambda part: figure.savefig(part, dpi=110))
-    print(f"wrote {name}.csv and {name}.png")
+            seconds, psnr, spread, color=f"C{number}", marker="osD^vX"[number], capsize=2)
+        ends.append((method, seconds[-1], psnr[-1], f"C{number}"))
+    low, high = axis.get_ylim()
+    heights = spread_out([psnr for _, _, psnr, _ in ends], (high - low) / 17)
+    for (name, seconds, psnr, color), height in zip(ends, heights):
+        axis.annotate(
+            name, (seconds, psnr), (1.04, height), va="center", color=color,
+            textcoords=axis.get_yaxis_transform(), arrowprops=dict(arrowstyle="-", color=color))
 
 
 # ---- Tests of Part II ----------------------------------------------------------------------------
 
 FEW = dict(rays=64, photos=4, samples=4, bg_samples=6, hidden=16)
-RIVALS = {  # tiny, of each method that is none of ours
+RIVALS = {  # tiny
     title: row._replace(settings=FEW | dict(rays=256, photos=min(64, row.settings["photos"])))
-    for title, row in SMALL.items() if issubclass(row.kind, Rival)}
+    for title, row in METHODS.items() if issubclass(row.kind, Rival)}
 
 
 def rival(scene, name):
-    torch.manual_seed(0)
-    row = RIVALS[name]
-    return row.kind(geonvs.Config(**row.settings), scene)
+    kind = RIVALS[name].kind
+    return kind(geonvs.Config(**RIVALS[name].settings), scene)
 
 
-def close_to(a, b, atol=1e-4):
-    torch.testing.assert_close(a, b, rtol=1e-4, atol=atol)
-
-
-# ---- Rivals
+# ---- Rivals and other forms
 
 @pytest.mark.parametrize("name", RIVALS)
 def test_losses_of_rivals_are_finite_and_reach_every_parameter(scene, name):
     model = rival(scene, name)
     gen = generator()
-    for step in range(2):  # the second knows another photo's code
-        rays, photos = model.batch(256, gen)
-        loss, terms, _ = model.losses(rays, photos, step / 2, gen)
-        model.zero_grad()
-        loss.backward()
+    rays, photos = model.batch(256, gen)
+    loss, terms, _ = model.losses(rays, photos, 0.0, gen)
+    loss.backward()
     assert all(value.isfinite().all() for value in terms.values())
     for value in model.parameters():
         assert value.grad.any()
 
 
 def test_nerfw_mixes_static_and_transient_as_its_equation_says(scene):
-    model = rival(scene, "nerfw")
+    model = rival(scene, "NeRF-W")
     rays, _ = model.batch(64, generator())
     t = torch.tensor([[1.0, 1.5, 1.7]]).repeat(64, 1)
     code = model.codes()[rays.img]
@@ -4324,46 +4031,49 @@ def test_nerfw_mixes_static_and_transient_as_its_equation_says(scene):
             color += passes * moving * h[1:4].sigmoid()
             beta += passes * moving * F.softplus(h[4])
             passes *= (1 - static) * (1 - moving)
-        close_to(out["rgb"][r], color)
-        close_to(out["beta"][r], beta)
+        assert_tensors_close(out["rgb"][r], color, 1e-4)
+        assert_tensors_close(out["beta"][r], beta, 1e-4)
+
+
+def test_opacities_of_a_density_follow_the_lengths_between_its_samples(scene):
+    model = Density(geonvs.Config(**FEW), scene)
+    rays, _ = model.batch(64, generator())
+    t0 = torch.full((64, 1), 0.5)
+    t = model.sample(rays, t0, t0 + 2, torch.full((64, 3), 0.5))
+    sdf = torch.tensor([0.3, 0.1, -0.1, -0.3, 0.2]).repeat(64, 1)
+    alpha = model.alpha(sdf)
+    for i in range(4):
+        sigma = math.exp(-5 * (sdf[0, i] + sdf[0, i + 1]))
+        length = t[:, i + 1] - t[:, i]
+        assert_tensors_close(alpha[:, i], 1 - torch.exp(-sigma * length), 1e-4)
+
+
+def test_a_uniform_grid_has_every_cell_of_its_last_level(scene):
+    octree = UniformGrid(geonvs.Config(**FEW, levels=3), scene).sdf.octree
+    assert octree.cells[:, 0].bincount().tolist() == [16**3, 32**3, 64**3]
+    assert octree.features.all()
 
 
 # ---- Splats
 
-def some_gaussians():
-    gen = generator()
-    center = 20 * torch.rand(9, 2, generator=gen)
-    half = 3 * torch.randn(9, 2, 2, generator=gen)
-    cov = half @ half.mT + torch.eye(2)
-    opacity = torch.rand(9, generator=gen)
-    rgb = torch.rand(9, 3, generator=gen)
-    xy = 20 * torch.rand(30, 2, generator=gen)
-    return [value.double() for value in (center, cov, opacity, rgb, xy)]
-
-
 def test_splats_equal_a_loop_over_pixels_and_gaussians(monkeypatch):
     monkeypatch.setitem(globals(), "REACH", 9.0)
-    center, cov, opacity, rgb, xy = some_gaussians()
+    center, xy = 20 * torch.rand(9, 2), 20 * torch.rand(5, 6, 2)
+    half = 3 * torch.randn(9, 2, 2)
+    cov = half @ half.mT + torch.eye(2)
+    opacity, rgb = torch.rand(9), torch.rand(9, 3)
     picture, trans = splat(center, cov, opacity, rgb, xy)
-    for r in range(len(xy)):
+    for place in itertools.product(range(5), range(6)):
         color = 0
         passes = 1.0
         for n in range(len(center)):
-            d = xy[r] - center[n]
+            d = xy[place] - center[n]
             power = d @ cov[n].inverse() @ d / 2
             alpha = opacity[n] * torch.exp(-power)
             color += passes * alpha * rgb[n]
             passes *= 1 - alpha
-        close_to(picture[r], color)
-        close_to(trans[r], passes)
-
-
-def test_gradients_of_splats_equal_differences(monkeypatch):
-    monkeypatch.setitem(globals(), "REACH", 9.0)
-    *inputs, xy = some_gaussians()
-    for value in inputs:
-        value.requires_grad_()
-    torch.autograd.gradcheck(lambda *values: splat(*values, xy)[0], inputs)
+        assert_tensors_close(picture[place], color, 1e-4)
+        assert_tensors_close(trans[place], passes, 1e-4)
 
 
 def test_a_projected_gaussian_has_the_spread_of_projected_samples():
@@ -4376,8 +4086,23 @@ def test_a_projected_gaussian_has_the_spread_of_projected_samples():
     samples = x + normal @ axes[0].T
     pixels = samples[:, :2] / samples[:, 2:] * K[:2] + K[2:]
     spread = pixels.T.cov() + BLUR * torch.eye(2)
-    close_to(center[0], pixels.mean(0), atol=0.02)
-    close_to(cov[0], spread, atol=0.02)
+    assert_tensors_close(center[0], pixels.mean(0), 0.02)
+    assert_tensors_close(cov[0], spread, 0.02)
+
+
+def test_a_view_shows_gaussians_where_the_rays_through_them_are(scene):
+    model = rival(scene, "splats")
+    order, center, _, _ = model.view(1)
+    depth = (model.center[order] - scene.c2w[1, :, 3]) @ scene.c2w[1, :, 2]
+    assert (depth.diff() >= 0).all()  # front first
+    rays = geonvs.photo_rays(scene, 1)
+    w, h = scene.wh[1].tolist()
+    for n in range(0, len(order), 97):
+        col, row = center[n].long().tolist()
+        if 0 <= col < w and 0 <= row < h:
+            ray = row * w + col
+            to_center = F.normalize(model.center[order[n]] - rays.o[ray], dim=0)
+            assert (to_center - rays.d[ray]).norm() < 1.5 / scene.K[1, 0]
 
 
 def test_splats_render_a_ray_alike_among_any_others(scene):
@@ -4389,63 +4114,52 @@ def test_splats_render_a_ray_alike_among_any_others(scene):
     for i in (3, 50):
         ray = geonvs.Rays(*[column[i:i + 1] for column in rays])
         alone = model.render(ray, code[i:i + 1])["rgb"]
-        close_to(alone[0], together[i])
+        assert_tensors_close(alone[0], together[i], 1e-4)
 
 
 # ---- Experiments
 
 @pytest.fixture
-def quick_rows(monkeypatch, tmp_path):
-    """Runs take a second, in a folder of their own."""
-    monkeypatch.chdir(tmp_path)
+def quick_rows(monkeypatch, in_tmp_dir):
+    """Trainings take a second, in a folder of their own."""
     monkeypatch.setattr(geonvs, "fit_codes", functools.partial(geonvs.fit_codes, steps=2, n=8))
     monkeypatch.setattr(geonvs, "extract_mesh", lambda model: [np.zeros((0, 3))] * 2)
-    monkeypatch.setattr(geonvs, "toy_truth", lambda *_: {})
-    raw = toy()
-    monkeypatch.setattr(data_prep, "open_scene", lambda *_: raw)
-    monkeypatch.setattr(data_prep, "make_toy", lambda **knobs: raw)
-    few = {title: row._replace(settings=row.settings | FEW) for title, row in SMALL.items()}
-    monkeypatch.setitem(globals(), "SMALL", few | RIVALS)
+    monkeypatch.setattr(data_prep, "open_scene", lambda *_: toy())
+    monkeypatch.setitem(globals(), "make_toy_once", lambda **knobs: toy())
+    methods = {"Geo-NVS-w": Row(), "splats": RIVALS["splats"], "NeRF-W": RIVALS["NeRF-W"]}
+    monkeypatch.setitem(globals(), "METHODS", methods)
     monkeypatch.setitem(globals(), "STRESS", {"crowd": STRESS["crowd"]})
     return [f"--{key}={value}" for key, value in FEW.items()]
 
 
-REPLACING = {
-    title: row
-    for title, row in (PAPER | PIECES | GRID).items()
-    if row.replaced or row.kind is not geonvs.GeoNVS}
-REPLACING["no threshold by place"] = Row(replaced=dict(PLACE_FACTOR=1e9))  # seen in ten steps
-
-
 @functools.cache
 def last_line(title):
-    """Of a run's log, without its time."""
-    row = REPLACING.get(title, Row())
-    run_row(Path(title), FEW | dict(steps=10, levels=3), row)
+    """Of a training's log, without its time."""
+    run_row(Path(title), FEW | dict(steps=4, levels=3), (PARTS | GRID)[title])
     line = Path(title, "log.jsonl").read_text().splitlines()[-1]
     return json.loads(line) | dict(seconds=0)
 
 
-@pytest.mark.parametrize("title", REPLACING)
-def test_what_a_row_replaces_is_there_and_changes_the_run(quick_rows, title):
-    assert last_line(title) != last_line("full")
-    for name, value in REPLACING[title].replaced.items():
-        assert getattr(geonvs, name) is not value  # only during the run
+@pytest.mark.parametrize("title", [*PARTS, "uniform grid"][1:])
+def test_each_row_of_parts_and_grid_changes_the_training(quick_rows, title, monkeypatch):
+    monkeypatch.setattr(geonvs, "finish", lambda *_: dict(psnr=20.0))
+    assert last_line(title) != last_line("Geo-NVS-w")
 
 
-@pytest.mark.parametrize("name, rows", dict(chart=18, paper=2, pieces=2, grid=2, stress=6).items())
-def test_an_experiment_writes_table_and_figure_and_reads_rows_again(
-        quick_rows, name, rows, monkeypatch):
-    monkeypatch.setitem(globals(), "PAPER", {k: PAPER[k] for k in ("full", "no mask")})
-    monkeypatch.setitem(globals(), "PIECES", {k: PIECES[k] for k in ("full", "no normal")})
-    argv = [name, "--steps=1", "--seeds=1", *quick_rows]
+@pytest.mark.parametrize("name, rows", dict(chart=9, parts=2, grid=2, stress=4).items())
+def test_an_experiment_writes_and_prints_a_table_and_reads_trainings_again(
+        quick_rows, name, rows, monkeypatch, capsys):
+    monkeypatch.setitem(globals(), "PARTS", {k: PARTS[k] for k in ("Geo-NVS-w", "no mask")})
+    argv = [name, "--steps=4", "--seeds=1", *quick_rows]
     experiment(argv)
     table = Path(f"{name}.csv").read_text()
     assert len(table.splitlines()) == 1 + rows
-    assert Path(f"{name}.png").stat().st_size > 1000
+    assert len(re.findall(r"^\|", capsys.readouterr().out, re.M)) == 2 + rows
     monkeypatch.setattr(geonvs, "train", None)  # nothing is trained again
     experiment(argv)
     assert Path(f"{name}.csv").read_text() == table
+    with pytest.raises(UserError) if name != "chart" else contextlib.nullcontext():
+        experiment(["draw"])
 
 
 def diverge(*_, **__):
@@ -4456,11 +4170,14 @@ def fill_disk(*_, **__):
     raise UserError("cannot write") from OSError()
 
 
-@pytest.mark.parametrize("fail, message", {diverge: "first row", fill_disk: "write"}.items())
-def test_a_failed_run_is_a_result_and_a_full_disk_is_none(quick_rows, fail, message, monkeypatch):
-    monkeypatch.setattr(geonvs, "train", fail)
-    with pytest.raises(UserError, match=message):
-        experiment(["grid", *quick_rows])
+def test_a_failed_training_is_a_result_and_a_full_disk_is_none(quick_rows, monkeypatch, capsys):
+    monkeypatch.setattr(geonvs, "train", diverge)
+    experiment(["grid", "--seeds=2"])
+    assert "| octree (2 of 2 failed) |" in capsys.readouterr().out
+    shutil.rmtree("runs")
+    monkeypatch.setattr(geonvs, "train", fill_disk)
+    with pytest.raises(UserError, match="write"):
+        experiment(["grid"])
 
 
 def test_one_thread_is_timed_by_its_work(quick_rows, monkeypatch):
@@ -4470,51 +4187,47 @@ def test_one_thread_is_timed_by_its_work(quick_rows, monkeypatch):
     assert clocks == [time.process_time] and time.perf_counter is not time.process_time
 
 
-def test_the_time_to_a_level_is_interpolated_between_whole_runs():
-    points = [(10, 15.0), (20, 17.0), (40, 19.0), (80, None)]
-    lines = [dict(seconds=seconds, psnr=psnr) for seconds, psnr in points]
-    assert time_to(lines, 18, "seconds") == pytest.approx(20 * 2**0.5)
-    assert time_to(lines, 14, "seconds") == 10
-    assert time_to(lines, 20, "seconds") is None
+def test_a_table_has_mean_and_deviation_of_what_was_measured():
+    runs = [
+        dict(psnr=20.0, psnr_floor=16.0, ssim=0.5, sdf_error=None),
+        dict(psnr=23.0, psnr_floor=16.0, ssim=0.7, sdf_error=None),
+        dict(failed="diverged")]
+    line = summary("no mask", runs)
+    assert line["psnr"] == 21.5
+    assert line["psnr_std"] == pytest.approx(1.5 * 2**0.5)  # n - 1
+    assert line["sdf_error"] is None
+    assert markdown([line, summary("one", runs[:1])]).splitlines() == [
+        "| row | PSNR, dB | SSIM |",
+        "| --- | --- | --- |",
+        "| no mask (1 of 3 failed) | 21.50 ± 2.12 | 0.600 ± 0.141 |",
+        "| one | 20.00 | 0.500 |"]
 
 
-def test_a_chart_draws_each_method_over_its_cost_and_the_baseline():
-    costs, values = [15.0, 60.0], {"ours": [20.0, 24.0], "theirs": [22.0, 23.0]}
-    table = []
-    for method, curve in values.items():
-        for cost, psnr in zip(costs, curve):
-            table.append(dict(row=f"{method} x{cost}", train_seconds=cost, energy_wh=None,
-                              psnr=psnr, psnr_std=0.5, psnr_floor=16.0))
-    axis, = draw_chart(table).axes
-    curves = {curve.get_label(): curve.lines[0].get_xydata() for curve in axis.containers}
-    assert set(curves) == set(values)
-    for method, curve in values.items():
-        np.testing.assert_array_equal(curves[method], np.stack([costs, curve], 1))
-    baseline, = [line for line in axis.lines if line.get_label() == "baseline"]
-    assert set(baseline.get_ydata()) == {16.0}
+def test_a_chart_shows_each_method_and_the_baseline_and_none_hides_another():
+    from matplotlib.figure import Figure
+    values = {"ours": [20.0, 24.0], "theirs": [20.0, 24.0], "old": [15.0, 17.0]}
+    axis = Figure().subplots()
+    draw_chart(axis, [
+        dict(row=f"{method} x{i}", train_seconds=[15, 60][i], psnr=values[method][i],
+             psnr_std=0.5, psnr_floor=16.0)
+        for i in range(2) for method in values])
+    assert axis.get_xscale() == "log"
+    assert set(axis.lines[0].get_ydata()) == {16.0}
+    curves = [curve.lines[0].get_xydata() for curve in axis.containers]
+    for curve, psnr in zip(curves, values.values(), strict=True):
+        np.testing.assert_array_equal(curve[:, 1], psnr)
+        assert_arrays_close(np.log(curve[:, 0] / [15, 60]), 0, atol=0.1)
+    assert (abs(np.log(curves[0] / curves[1])[:, 0]) > 0.03).all()
+    heights = {text.get_text(): text.xyann[1] for text in axis.texts}
+    assert list(heights) == ["baseline", *values]
+    assert heights["theirs"] - heights["ours"] > 0.5 and abs(heights["old"] - 17) < 0.5
 
 
-def test_bars_show_what_a_row_gains_over_the_first_and_cells_over_their_baseline():
-    table = [
-        dict(row="crowd: full", psnr=20.0, psnr_std=0.5, psnr_floor=16.0),
-        dict(row="crowd: no mask", psnr=17.5, psnr_std=0.5, psnr_floor=16.0),
-        dict(row="sky: splats", psnr=21.0, psnr_std=None, psnr_floor=18.0),
-        dict(row="sky: nerfw", psnr=None, psnr_std=None, psnr_floor=18.0)]
-    bars, = draw_bars(table).axes
-    names = [label.get_text() for label in bars.get_yticklabels()]
-    gains = {names[round(bar.get_center()[1])]: bar.get_width() for bar in bars.patches}
-    assert gains == {"crowd: full": 0.0, "crowd: no mask": -2.5, "sky: splats": 1.0}
-
-    cells, = draw_cells(table).axes
-    names = [label.get_text() for label in cells.get_yticklabels()]
-    markers = []
-    for marker in cells.containers:
-        gain, place = marker.lines[0].get_xydata()[0]
-        markers.append((marker.get_label(), names[round(place)], gain))
-    assert markers == [
-        ("full", "crowd (no mask)", 4.0),
-        ("as in brackets", "crowd (no mask)", 1.5),
-        ("splats", "sky (no threshold by place)", 3.0)]
+def test_numbers_that_are_close_are_spread_out_in_their_order():
+    assert_arrays_close(spread_out([5.0, 1.0, 1.5], 1), [5, 0.75, 1.75])
+    moved = spread_out([3.0, 3.0, 2.9, 9.0], 0.5)
+    assert (np.diff(np.sort(moved)) > 0.499).all()
+    assert moved[2] < moved[0] and moved[3] == 9
 
 
 if __name__ == "__main__":
