@@ -1204,7 +1204,8 @@ class GeoNVS(nn.Module):
         rgb = shade(self, rays, code, hits, F.normalize(grad[:R]))  # (R,3)
         residual = (rgb - rays.rgb).abs()  # (R,3)
         error = residual.detach().amax(1)  # (R,) of the worst channel
-        left_out, reg, gpl, phi = self.transients(rays, photos, hits, error, done)
+        phi = self.phi(hits)  # (R,)
+        left_out, reg, gpl = self.transients(rays, photos, hits.place, phi, error, done)
         pull = self.zeta().detach().clamp_max(MAX_PULL)  # at first s must be free to change [D5]
         _, s_sfm, s_air = s.split([R, n, n])
         loss = dict(
@@ -1224,14 +1225,17 @@ class GeoNVS(nn.Module):
             phi_spread=phi.std(correction=0))
         return objective(loss, cfg), log
 
-    def transients(self, rays, photos, hits, error, done):
-        """Section 6 for rays with hits and errors (R,). Returns what L_rgb leaves out (R,): M, or 1
-        for rejected outliers and for pixels that a user's mask excludes; L_reg; L_GPL; Phi (R,)."""
-        e_grad, e_curv = self.cache.errors(hits.x)  # (R,)
+    def phi(self, hits):
+        """Phi (R,) of rays with hits. Eq. 4"""
+        ray_complexity = complexity(*self.cache.errors(hits.x))  # (R,)
         if self.cfg.printed("phi"):
-            phi = paper_phi(complexity(e_grad, e_curv))
-        else:
-            phi = edge_indicator(complexity(e_grad, e_curv), hits.opacity.detach())
+            return paper_phi(ray_complexity)
+        return edge_indicator(ray_complexity, hits.opacity.detach())
+
+    def transients(self, rays, photos, place, phi, error, done):
+        """Section 6 for rays that end at places (R,3), with Phi and errors (R,). Returns what L_rgb
+        leaves out (R,), which is M, or 1 for rejected outliers and for pixels that a user's mask
+        excludes; L_reg; L_GPL."""
         left_out = torch.zeros_like(error)
         reg = gpl = error.new_zeros(())
         if self.has_mask:
@@ -1245,11 +1249,11 @@ class GeoNVS(nn.Module):
                 reg = paper_mask_loss(M * is_counted, error)
                 left_out = M.detach()
             else:
-                excess = error - self.usual_errors.threshold(hits.place)
+                excess = error - self.usual_errors.threshold(place)
                 reg = mask_loss(logit, excess * is_counted)
                 left_out = reject_outliers(M.detach(), excess > 0, done)
             gpl = gpl_loss(M, phi * is_counted)
-        return left_out.masked_fill(rays.is_masked, 1), reg, gpl, phi
+        return left_out.masked_fill(rays.is_masked, 1), reg, gpl
 
     def remember(self, rays, hits, error):
         """Follows the errors (R,) of a step's rays: for the mask's threshold those of a place, for

@@ -3577,7 +3577,8 @@ class Splats(Rival):
         nn.init.normal_(self.appearance.weight, std=0.01)
         self.has_mask = cfg.mask != "off"
         if self.has_mask:
-            self.mask = geonvs.TransientMask(scene)
+            self.mask = geonvs.TransientMask(scene.thumbs)
+            self.usual_errors = geonvs.UsualErrors()
 
     def groups(self):
         rates = [
@@ -3618,7 +3619,8 @@ class Splats(Rival):
             xy = rays.uv[mine, None] * self.scene.wh[photo]  # (R,1,2) px, each ray a tile
             picture, _ = self.draw(view, code[mine][0], xy)
             rgb[mine] = picture[:, 0]
-        return dict(rgb=rgb, normal=torch.zeros_like(rgb), depth=torch.zeros_like(rgb[:, 0]))
+        none = torch.zeros_like(rgb)
+        return geonvs.Rendering(rgb, none[:, 0], none[:, 0], none)
 
     def view(self, photo):
         """Which Gaussians a photo sees, front first (N,); their centres (N,2) px and covariances
@@ -3666,18 +3668,17 @@ class Splats(Rival):
         left_out, reg = self.transients(rays, photos, residual.detach().amax(1), distance, done)
         loss = ((1 - left_out) * residual.mean(1)).mean()
         mse = residual.detach().square().mean()
-        return loss + reg, dict(rgb=loss, reg=reg, mse=mse), {}
+        return loss + reg, dict(rgb=loss, reg=reg, mse=mse)
 
     def transients(self, rays, photos, error, distance, done):
-        """What the loss leaves out (R,), and L_reg: GeoNVS.transients, without complexity, at the
-        places at distance (R,1)."""
+        """What the loss leaves out (R,), and L_reg: GeoNVS.transients, with Phi 0, at the places at
+        distance (R,1)."""
         none = torch.zeros_like(error)
         if not self.has_mask:
             return none, none.sum()
         place = geonvs.contract(rays.at(distance)[:, 0])  # (R,3)
-        out = dict(ray_e_grad=none, ray_e_curv=none, opacity=none, is_solid=none > 0, place=place)
-        left_out, reg, _, out["complexity"] = self.mask_rays(rays, photos, out, error, done)
-        self.mask.update_quantiles(rays, out, error)
+        left_out, reg, _ = self.mask_rays(rays, photos, place, none, error, done)
+        self.usual_errors.update(place, error, ~rays.is_masked)
         return left_out, reg
 
 
