@@ -107,6 +107,7 @@ def setting(default, meaning, least=0, choices=()):
 SCENES = ("toy", *data_prep.SCENES)
 DEVICES = ("auto", "cpu", "cuda")
 SWITCH = ("auto", "on", "off")
+PRINTED = ("alpha", "phi", "reg", "zeta")  # equations that --paper can choose
 GROUPS = dict(  # titles in --help, by the first setting of each group
     scene="what", steps="how long", rays="model", lam_eik="loss weights", lr_grid="learning rates")
 

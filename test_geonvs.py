@@ -3365,7 +3365,7 @@ class Rival(nn.Module):
     def do_nothing(self, *_):
         pass
 
-    before_step = after_training = update_statistics = refine = decide_mask = do_nothing
+    before_step = after_training = refine = do_nothing
 
 
 def layers(*sizes):
@@ -3427,7 +3427,9 @@ class NeRFW(Rival):
 
     def render(self, rays, code):
         middle = code.new_full((2, len(code), self.cfg.samples), 0.5)
-        return self.trace(rays, code, middle)
+        out = self.trace(rays, code, middle)
+        none = torch.zeros_like(out["rgb"])  # it has no normals
+        return geonvs.Rendering(out["rgb"], none[:, 0], out["depth"], none)
 
     def trace(self, rays, code, jitter, other=None):
         """Coarse and fine pass with n samples and 2n. jitter: (2,R,n) in 0..1, for each network's
@@ -3442,9 +3444,8 @@ class NeRFW(Rival):
         t_fine = geonvs.inverse_cdf(edges, weight, geonvs.stratified(fine_jitter))  # (R,n)
         t, _ = torch.cat([t, t_fine], 1).sort(1)  # (R,2n)
         out = self.pass_through(self.fine, rays, t, code, other)
-        normal = torch.zeros_like(out["rgb"])  # for panels
         depth = (out["w"] * t).sum(1).detach()
-        return out | dict(coarse=coarse["rgb"], normal=normal, depth=depth)
+        return out | dict(coarse=coarse["rgb"], depth=depth)
 
     def pass_through(self, field, rays, t, code, other=None):
         """Densities to a picture: C = sum T (alpha_s c_s + alpha_t c_t). NeRF-W Eq. 5"""
@@ -3483,7 +3484,7 @@ class NeRFW(Rival):
             beta=3 + beta.log().mean(),
             sigma=0.01 * out["sigma_t"].mean())
         mse = error.detach().mean() / 3
-        return sum(terms.values()), terms | dict(mse=mse), out
+        return sum(terms.values()), terms | dict(mse=mse)
 
 
 # ---- Rival: Gaussian splats ----------------------------------------------------------------------
@@ -4005,7 +4006,7 @@ def test_losses_of_rivals_are_finite_and_reach_every_parameter(scene, name):
     model = rival(scene, name)
     gen = generator()
     rays, photos = model.batch(256, gen)
-    loss, terms, _ = model.losses(rays, photos, 0.0, gen)
+    loss, terms = model.losses(rays, photos, 0.0, gen)
     loss.backward()
     assert all(value.isfinite().all() for value in terms.values())
     for value in model.parameters():
@@ -4111,10 +4112,10 @@ def test_splats_render_a_ray_alike_among_any_others(scene):
     img = torch.tensor([0, 1, 1, 2]).repeat(25)
     rays = geonvs.random_rays(scene, img, generator())
     code = model.codes()[img]
-    together = model.render(rays, code)["rgb"]
+    together = model.render(rays, code).rgb
     for i in (3, 50):
         ray = geonvs.Rays(*[column[i:i + 1] for column in rays])
-        alone = model.render(ray, code[i:i + 1])["rgb"]
+        alone = model.render(ray, code[i:i + 1]).rgb
         assert_tensors_close(alone[0], together[i], 1e-4)
 
 
