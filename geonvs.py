@@ -1394,8 +1394,8 @@ def fingerprint(raw):
 
 
 def save(run, model, optimizer, gen, state, terms):
-    """Adds a line to the log, replaces checkpoint.pt, which has the log in it, and log.jsonl, then
-    prints."""
+    """Adds a line to the log, replaces checkpoint.pt, which holds the log, too, and log.jsonl, then
+    prints. terms: the step's losses."""
     line = dict(step=state.step, seconds=state.seconds, joules=state.joules)
     line |= {key: value.item() for key, value in terms.items()}
     line["psnr"] = -10 * math.log10(line["mse"] + 1e-10)  # of the step's rays, people included
@@ -1416,7 +1416,7 @@ def save(run, model, optimizer, gen, state, terms):
     torch.save(saved, buffer)
     atomic_write(run / "checkpoint.pt", lambda part: part.write_bytes(buffer.getbuffer()))
     atomic_write(log, lambda part: part.write_text("".join(state.log)))
-    done = min(state.share_done(model.cfg), 1)
+    done = min(1, state.share_done(model.cfg))
     print(f"  {done:4.0%}  step {state.step}  psnr {line['psnr']:.2f}", flush=True)
 
 
@@ -1505,7 +1505,10 @@ def train(cfg, scene, run, saved=None, processes=ALONE):
     done = state.share_done(cfg)
     if done >= MASK_TRAINING:  # again, as --steps and --mask may have been given anew
         model.decide_mask(processes)
-    if saved and done < 1 and processes.is_first:
+    if done >= 1:
+        model.after_training()
+        return model, state
+    if saved and processes.is_first:
         for name in ("metrics.json", "codes.npy"):  # of the shorter training
             (run / name).unlink(missing_ok=True)
         atomic_write(run / "log.jsonl", lambda part: part.write_text("".join(state.log)))
@@ -1663,14 +1666,14 @@ def toy_truth(model, scene):
     """Errors of surface and mask that only a toy can tell: see data_prep.toy_truth."""
     near, wall = [torch.as_tensor(scene.raw[key]).to(scene.c2w) for key in ("near_wall", "wall")]
     _, gradient, _ = model.sdf.derivatives(wall, 0.004)
-    mask = None
+    sdf = model.distance(near)
+    M = None
     if model.has_mask:
-        masks = [
-            sample_logits(model.mask.logits([photo]), photo_rays(scene, photo).uv).sigmoid()
+        logits = [
+            sample_logits(model.mask.logits([photo]), photo_rays(scene, photo).uv)
             for photo in scene.train.tolist()]
-        mask = torch.cat(masks).cpu().numpy()
-    sdf = model.distance(near).cpu().numpy()
-    return data_prep.toy_truth(scene.raw, sdf, gradient.cpu().numpy(), mask)
+        M = torch.cat(logits).sigmoid().cpu().numpy()
+    return data_prep.toy_truth(scene.raw, sdf.cpu().numpy(), gradient.cpu().numpy(), M)
 
 
 def extract_mesh(model):
@@ -1810,6 +1813,7 @@ def finish(model, scene, state, run, processes=ALONE):
     is_metered = state.joules is not None
     is_cuda = scene.c2w.is_cuda
     threads = f"cpu, {torch.get_num_threads()} threads"
+    buffers = [tensor for octree in model.octrees for tensor in octree.buffers()]
     memory = peak_memory(is_cuda)  # of training
     pictures = {}
     scores, codes = evaluate(model, scene, make_lpips(), pictures)
@@ -1822,7 +1826,6 @@ def finish(model, scene, state, run, processes=ALONE):
         write_ply(run / "mesh.ply", vertices, faces, to_uint8(mesh_colors(model, vertices)))
         if "wall" in scene.raw:
             scores |= toy_truth(model, scene)
-    buffers = [tensor for octree in model.octrees for tensor in octree.buffers()]
     metrics = dict(
         scene=scene.info["scene"],
         method=model.name,
