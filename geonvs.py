@@ -61,7 +61,6 @@ one is worth.
                                            need are off                       fail
 """
 import argparse
-import collections
 import contextlib
 import functools
 import io
@@ -70,12 +69,10 @@ import math
 import os
 import shutil
 import signal
-import statistics
 import subprocess
 import sys
 import tempfile
 import time
-import zlib
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import NamedTuple
@@ -97,11 +94,12 @@ from data_prep import (
 torch.set_float32_matmul_precision("highest")
 
 
-# ---- 1 Settings, whose fields are flags, and processes -------------------------------------------
+# ---- 1 Settings and processes --------------------------------------------------------------------
 
-def setting(default, meaning, least=0, choices=()):
-    """A field of Config: its meaning for --help, its least value, or the values it may have."""
-    return field(default=default, metadata=dict(meaning=meaning, least=least, choices=choices))
+def setting(default, meaning, **limits):
+    """A field of Config, which is a flag: its meaning for --help, and its least value (else 0), the
+    choices there are, or what the flag means alone, without a value."""
+    return field(default=default, metadata=dict(meaning=meaning, **limits))
 
 
 SCENES = ("toy", *data_prep.SCENES)
@@ -126,14 +124,14 @@ class Config:
     rays: int = setting(512, "rays per step, of each process", least=2)
     photos: int = setting(8, "photos per step, of each process", least=1)
     samples: int = setting(15, "intervals of a ray in the foreground", least=3)
-    bg_samples: int = setting(24, "background samples, a sixth in front", least=6)
+    bg_samples: int = setting(24, "background samples of a ray", least=2)
     levels: int = setting(0, "octree levels, 0: as fine as a pixel", choices=range(9))
     hidden: int = setting(64, "width of the networks", least=1)
     appearance_dim: int = setting(16, "length of a photo's appearance code")
     appearance: str = setting("auto", "codes: on, off, auto (if exposures differ)", choices=SWITCH)
     mask: str = setting("on", "transient mask: on, off", choices=("on", "off"))
     background: str = setting("auto", "a field: on, off, auto (unless one colour)", choices=SWITCH)
-    paper: str = setting("", "equations as printed: alpha, phi, reg, zeta")
+    paper: str = setting("", f"as printed: all or {','.join(PRINTED)}", alone=",".join(PRINTED))
     lam_eik: float = setting(0.004, "L_eik, eikonal (Permuto-SDF: 0.04)")
     lam_curv: float = setting(0.01, "L_curv, curvature: |lap s| eps [D2]")
     lam_mask: float = setting(1.0, "L_reg, which trains the mask [D3]")
@@ -150,33 +148,29 @@ class Config:
         """Refuses what cannot work, before anything is written."""
         for option in fields(self):
             value = getattr(self, option.name)
-            _, least, choices = option.metadata.values()
-            if choices:
-                words = ", ".join(map(str, choices))
-                check(value in choices, f"--{option.name} {value} is unknown: use one of {words}")
-            elif option.type is not str:
-                check(least <= value < 2**31,
-                      f"--{option.name} {value} is out of range: use {least} to 2^31 - 1")
+            least = option.metadata.get("least", 0)
+            choices = option.metadata.get("choices", [value])
+            words = ", ".join(map(str, choices))
+            check(value in choices, f"--{option.name} {value} is unknown: use one of {words}")
+            check(option.type is str or least <= value < 2**31,
+                  f"--{option.name} {value} is out of range: use {least} to 2^31 - 1")
+        check(set(self.paper.split(",")) <= {"", *PRINTED},
+              f"--paper {self.paper} is unknown: use some of {','.join(PRINTED)}")
         if self.data:
             self.data = os.path.realpath(self.data)  # to be found from any folder
-
-    def printed(self, name):
-        """Whether one of the equations PRINTED is to be as in the paper."""
-        return name in self.paper.split(",")
 
     @property
     def source(self):
         """What data_prep.open_scene takes: a folder, or a scene's name."""
         return self.data or self.scene
 
+    def printed(self, name):
+        """Whether an equation, one of PRINTED, has the form that is printed in the paper."""
+        return name in self.paper.split(",")
 
-# settings of photos on a GPU that differ from Config's defaults; flags override them
-GPU_DEFAULTS = dict(
-    steps=75_000,
-    rays=16_384,  # on an H100 a step takes as long with fewer: it is bound by kernel launches
-    photos=16,
-    samples=32,
-    appearance_dim=32)
+
+# Photos on a GPU, where flags do not say otherwise. A step there takes as long with fewer rays.
+GPU_DEFAULTS = dict(steps=75_000, rays=16_384, photos=16, samples=32, appearance_dim=32)
 
 
 @dataclass
@@ -195,9 +189,9 @@ class Processes:
     def join(self, device):
         """Connects this process with the others; those are silent."""
         check("MASTER_ADDR" in os.environ, "start processes by torchrun, or unset WORLD_SIZE")
-        has_nccl = device.type == "cuda" and dist.is_nccl_available()  # not on Windows
         if device.type == "cuda":
             torch.cuda.set_device(device)
+        has_nccl = device.type == "cuda" and dist.is_nccl_available()  # not on Windows
         dist.init_process_group("cpu:gloo,cuda:nccl" if has_nccl else "gloo")
         if not self.is_first:
             sys.stdout = open(os.devnull, "w", errors="replace")
@@ -1358,8 +1352,8 @@ def metered_joules(device, joules, processes=ALONE):
 
 # ---- 9 Training ----------------------------------------------------------------------------------
 
-LOG_EVERY = 30  # seconds between lines of the log; a checkpoint is made with each
 RESULTS = ("metrics.json", "codes.npy", "panel.png", "mesh.ply", "film.mp4")  # and held_out/
+LOG_EVERY = 30  # seconds between lines of the log; a checkpoint is made with each
 
 
 @dataclass
@@ -1401,29 +1395,26 @@ def training_step(model, optimizer, step, done, gen, processes=ALONE):
 
 
 def fingerprint(raw):
-    """What weights depend on: a checksum of each photo's place in the list, split, size and camera,
-    and one of the sphere. Rounded, as other machines prepare a scene with other last digits."""
+    """What weights depend on: each photo's place in the list, split, size and camera, by its name,
+    and the sphere. Rounded, as other machines prepare a scene with other last digits."""
     count = len(raw["name"])
     columns = [np.arange(count), raw["is_test"], raw["wh"], raw["K"], raw["c2w"]]
     photos = np.hstack([np.reshape(column, (count, -1)) for column in columns])
     sphere = np.append(raw["center"] / raw["scale"], np.log(raw["scale"]))
-    rows = [*photos, sphere]
-    checksums = [zlib.crc32((row.round(5) + 0).tobytes()) for row in rows]  # + 0: there is no -0
-    return dict(zip([*raw["name"].tolist(), "the sphere"], checksums))
+    rows = [row.round(5).tolist() for row in (*photos, sphere)]
+    return dict(zip([*raw["name"].tolist(), "the sphere"], rows))
 
 
-def save(run, model, optimizer, gen, state, terms, done):
-    """Adds a line to the log, replaces checkpoint.pt, which has the log in it, and log.jsonl, then
-    prints. Of two processes in a folder, one is the first to make or to change log.jsonl, and the
-    other one ends."""
+def save(run, model, optimizer, gen, state, terms):
+    """Adds a line to the log, replaces checkpoint.pt, which holds the log, too, and log.jsonl, then
+    prints. terms: the step's losses."""
     line = dict(step=state.step, seconds=state.seconds, joules=state.joules)
     line |= {key: value.item() for key, value in terms.items()}
     line["psnr"] = -10 * math.log10(line["mse"] + 1e-10)  # of the step's rays, people included
     log = run / "log.jsonl"
-    run.mkdir(parents=True, exist_ok=True)
-    log.touch(exist_ok=len(state.log) > 0)
-    check(log.read_text() == "".join(state.log), f"another process trains in {run}, too: stop it "
-          "and go on with --resume, or train beside it by --name NAME")
+    is_ours = "".join(state.log) == (log.read_text() if log.exists() else "")
+    check(is_ours, f"another process trains in {run}, too: stop it and go on with --resume, or "
+          "train beside it by --name NAME")
     state.log.append(json.dumps(line) + "\n")
     saved = dict(
         config=vars(model.cfg),
@@ -1437,55 +1428,47 @@ def save(run, model, optimizer, gen, state, terms, done):
     torch.save(saved, buffer)
     atomic_write(run / "checkpoint.pt", lambda part: part.write_bytes(buffer.getbuffer()))
     atomic_write(log, lambda part: part.write_text("".join(state.log)))
-    print(f"  {min(done, 1):4.0%}  step {state.step}  psnr {line['psnr']:.2f}", flush=True)
+    done = min(1, state.share_done(model.cfg))
+    print(f"  {done:4.0%}  step {state.step}  psnr {line['psnr']:.2f}", flush=True)
 
 
-@contextlib.contextmanager
-def refuses_damage():
-    """One sentence for whatever fails with a damaged checkpoint: zip, pickle, tensor storage."""
-    try:
-        yield
-    except UserError:
-        raise
-    except Exception as error:
-        raise UserError(
-            f"checkpoint.pt is damaged, or does not fit scene and settings ({error!r:.90}): use "
-            "the flags and kind of device that it was made with, or train under another --name")
-
-
-@refuses_damage()
 def read_checkpoint(path, given):
     """A checkpoint's dictionary, of tensors and plain values, never code; and its settings,
     replaced by those given."""
     check(path.exists(), f"{path} does not exist: train first, without --resume or --render, or "
-          "name the run by the --scene, --data, --seed or --name it was made with")
-    data_prep.refuse_bomb(path)
-    saved = dict(torch.load(path, map_location="cpu", weights_only=True))
-    settings = saved["config"] | given
-    unknown = settings.keys() - vars(Config()).keys()
-    check(not unknown, f"{path} has settings that this version of geonvs.py does not know "
-          f"({', '.join(map(str, unknown))}): use the version that made it, or another --name")
-    return saved, Config(**settings)
+          "name the run by the --scene, --data, --seed, --paper or --name it was made with")
+    try:
+        data_prep.refuse_bomb(path)
+        saved = dict(torch.load(path, map_location="cpu", weights_only=True))
+        return saved, Config(**saved["config"] | given)
+    except Exception as error:  # a damaged file fails in any layer: zip, pickle, tensor storage
+        raise UserError(f"{path} is damaged, or of another version of geonvs.py ({error!r:.90}): "
+                        "use that version, or train under another --name")
 
 
-@refuses_damage()
 def restore(saved, model, gen=None):
-    """Puts a checkpoint's weights into a model, and its random numbers into gen, which must be of
-    the same kind of device; returns its optimiser and State."""
-    before, now = saved["scene"], fingerprint(model.scene.raw)
-    changed = [name for name in before | now if before.get(name) != now.get(name)]
-    changed.sort(key=lambda name: name in before and name in now)  # missing and new ones first
-    check(not changed, f"checkpoint.pt was trained with other photos, splits, sizes or cameras: "
-          f"{len(changed)} differ, first {changed[:1]}: use its data, or another --name")
-    for octree, keys in zip(model.octrees, saved["octrees"], strict=True):
-        octree.build(keys.to(octree.child.device))
-    model.load_state_dict(saved["model"])
-    optimizer = make_optimizer(model)
-    groups = optimizer.state_dict()["param_groups"]  # learning rates may be given anew
-    optimizer.load_state_dict(dict(saved["optimizer"], param_groups=groups))
-    if gen:
-        gen.set_state(saved["generator"])
-    return optimizer, State(**saved["state"])
+    """Puts a checkpoint's weights into a model, and its random numbers into gen, if given, of the
+    same kind of device. Returns its optimiser and State."""
+    try:
+        before = saved["scene"]
+        now = fingerprint(model.scene.raw)
+        changed = [name for name in before | now if before.get(name) != now.get(name)]
+        check(not changed, "checkpoint.pt was trained with other photos, splits, sizes or cameras: "
+              f"{len(changed)} differ, first {changed[:1]}: use its data, or another --name")
+        for octree, keys in zip(model.octrees, saved["octrees"], strict=True):
+            octree.build(keys.to(octree.child.device))
+        model.load_state_dict(saved["model"])
+        optimizer = make_optimizer(model)
+        groups = optimizer.state_dict()["param_groups"]  # learning rates may be given anew
+        optimizer.load_state_dict(dict(saved["optimizer"], param_groups=groups))
+        if gen:
+            gen.set_state(saved["generator"])
+        return optimizer, State(**saved["state"])
+    except UserError:
+        raise
+    except Exception as error:
+        raise UserError(f"checkpoint.pt does not fit settings or kind of device ({error!r:.90}): "
+                        "use those it was made with, or train under another --name")
 
 
 def load_run(run, **given):
@@ -1505,27 +1488,12 @@ def load_run(run, **given):
     return model, scene, codes
 
 
-def lap_times():
-    """Yields 0, then the seconds since the last call. A gap that no step explains, as of Ctrl-Z, a
-    laptop's lid or a paused container, is no training: it counts as a usual step."""
-    recent = collections.deque(maxlen=50)
-    last = time.perf_counter()
-    yield 0.0
-    while True:
-        now = time.perf_counter()
-        lap = now - last
-        last = now
-        usual = statistics.median(recent or [lap])
-        if lap > max(10, 20 * usual):
-            lap = usual
-        recent.append(lap)
-        yield lap
-
-
-def check_finite(model):
-    check(all(p.isfinite().all() for p in model.parameters()),
-          "weights are no longer finite: correct the poses, or try a third of the learning rates "
-          "--lr_grid and --lr_net; an older checkpoint.pt, if any, is still there")
+def check_finite(tensors, cfg):
+    """UserError if numbers are infinite or not a number: the training diverged."""
+    cause = " (--paper: printed equations may do this)" if cfg.paper else ""
+    check(all(tensor.isfinite().all() for tensor in tensors),
+          f"numbers are no longer finite{cause}: correct the poses, or try a third of the learning "
+          "rates --lr_grid and --lr_net; an older checkpoint.pt, if any, is still there")
 
 
 def train(cfg, scene, run, saved=None, processes=ALONE):
@@ -1555,16 +1523,19 @@ def train(cfg, scene, run, saved=None, processes=ALONE):
         atomic_write(run / "log.jsonl", lambda part: part.write_text("".join(state.log)))
     meter = metered_joules(gen.device, state.joules, processes)
     next(meter, None)  # it counts from here
-    laps = lap_times()
-    seconds = state.seconds + next(laps)
+    seconds = state.seconds
     next_log = 0.0
-    caught = []
+    caught = []  # signals
     is_stopped = False
+    last = time.perf_counter()
     with on_signals(lambda number, _: caught.append(number)):
         while done < 1 and not is_stopped:
             terms = training_step(model, optimizer, state.step, done, gen, processes)
+            now = time.perf_counter()
+            longest = max(10, 20 * seconds / max(state.step, 1))
+            seconds += min(now - last, longest)  # a pause (Ctrl-Z, a laptop's lid) is no training
+            last = now
             state.step += 1
-            seconds += next(laps)
             # several processes agree now and then, and at the last step
             if processes.count == 1 or state.step % 16 == 0 or state.step == cfg.steps:
                 state.seconds, is_stopped = processes.share((seconds, len(caught) > 0))
@@ -1572,17 +1543,16 @@ def train(cfg, scene, run, saved=None, processes=ALONE):
             done = state.share_done(cfg)
             if any(before < share <= done for share in REFINE_AT):
                 model.refine(optimizer, processes)
-            if done >= 1:
-                model.after_training()
             if done >= 1 or is_stopped or state.seconds >= next_log:  # in all processes at once
                 next_log = state.seconds + LOG_EVERY
-                check_finite(model)
+                check_finite(model.parameters(), cfg)
                 if processes.is_first:
                     state.joules = next(meter, None)  # None, never 0, once a counter has failed
-                    save(run, model, optimizer, gen, state, terms, done)
+                    save(run, model, optimizer, gen, state, terms)
     if caught or is_stopped:
         raise KeyboardInterrupt(
             f"stopped; step {state.step} is saved, and the same command with --resume goes on")
+    model.after_training()
     return model, state
 
 
@@ -1599,8 +1569,29 @@ def to_uint8(picture):
 
 def psnr(error):
     """Peak signal-to-noise ratio in dB for the error of a picture in 0..1; at most 100."""
-    mse = (error**2).mean()
-    return -10 * math.log10(mse + 1e-10)
+    return -10 * math.log10((error**2).mean() + 1e-10)
+
+
+def photo_rays(scene, photo):
+    """The rays of all pixels of a photo, row by row."""
+    pixel = torch.arange(scene.wh[photo].prod(), device=scene.wh.device)
+    return make_rays(scene, torch.full_like(pixel, photo), pixel)
+
+
+@torch.no_grad()
+def render_photo(model, scene, photo, code):
+    """A photo's view under an appearance code (A,): its colours, the photo itself, normals as long
+    as the ray's opacity, each (H,W,3), and depth (H,W), along the ray."""
+    w, h = scene.wh[photo].tolist()
+    parts = []
+    for pixel in torch.arange(w * h, device=code.device).split(RENDER_RAYS[code.device.type]):
+        rays = make_rays(scene, torch.full_like(pixel, photo), pixel)
+        out = model.render(rays, code.expand(len(pixel), -1))
+        parts.append(torch.cat([out.rgb, rays.rgb, out.normal, out.depth[:, None]], 1))
+    check_finite(parts, model.cfg)
+    picture = torch.cat(parts).reshape(h, w, 10).cpu().numpy()
+    rgb, truth, normal, depth = np.split(picture, [3, 6, 9], axis=2)
+    return rgb, truth, normal, depth[..., 0]
 
 
 def fit_codes(model, scene, photos, steps=128, n=64):
@@ -1623,75 +1614,52 @@ def fit_codes(model, scene, photos, steps=128, n=64):
     return codes.detach()
 
 
-def photo_rays(scene, photo):
-    """The rays of all pixels of a photo, row by row."""
-    pixel = torch.arange(scene.wh[photo].prod(), device=scene.wh.device)
-    return make_rays(scene, torch.full_like(pixel, photo), pixel)
-
-
-@torch.no_grad()
-def render_photo(model, scene, photo, code):
-    """A photo's view under an appearance code (A,): its colours, the photo itself, normals as long
-    as the ray's opacity, each (H,W,3), and depth (H,W), along the ray."""
-    w, h = scene.wh[photo].tolist()
-    parts = []
-    columns = photo_rays(scene, photo)
-    for part in zip(*[column.split(RENDER_RAYS[code.device.type]) for column in columns]):
-        rays = Rays(*part)
-        out = model.render(rays, code.expand(len(rays.o), -1))
-        parts.append(torch.cat([out.rgb, rays.rgb, out.normal, out.depth[:, None]], 1))
-    picture = torch.cat(parts).reshape(h, w, 10).cpu().numpy()
-    rgb, truth, normal, depth = np.split(picture, [3, 6, 9], axis=2)
-    return rgb, truth, normal, depth[..., 0]
-
-
 def score(rgb, truth, masked, lpips=None):
     """The right half of a rendered photo, rounded to 8 bits, against the truth, beside a baseline
     (psnr_floor): each row of pixels in the mean colour of its left half. SSIM has a Gaussian window
     of 11 px with sigma 1.5 and no border. Pixels that a user's mask excludes, masked (H,W), are
     left out. None where a picture is too small, or nothing is left of it."""
     half = truth.shape[1] // 2
-    weight = ~masked[:, :half, None] + 1e-9  # so that a row without pixels has a mean, too
-    floor = np.average(truth[:, :half], 1, np.broadcast_to(weight, truth[:, :half].shape))
+    left = truth[:, :half]
     want = truth[:, half:]
     is_scored = ~masked[:, half:]
-    got = to_uint8(rgb[:, half:]) / 255
-    got = np.where(is_scored[..., None], got, want)  # no window sees a difference in the others
     row = dict(psnr=None, psnr_floor=None, ssim=None, lpips=None)
     row["masked_pixels"] = int((~is_scored).sum())
-    side = min(is_scored.shape)
-    if is_scored.any():
-        row["psnr"] = psnr((got - want)[is_scored])
-        row["psnr_floor"] = psnr((floor[:, None] - want)[is_scored])
-    if side >= 11 and is_scored[5:-5, 5:-5].any():
+    if not is_scored.any():
+        return row
+    got = to_uint8(rgb[:, half:]) / 255
+    got = np.where(is_scored[..., None], got, want)  # no window sees a difference in the others
+    weight = ~masked[:, :half, None] + 1e-9  # so that a row without pixels has a mean, too
+    floor = (weight * left).sum(1) / weight.sum(1)
+    row["psnr"] = psnr((got - want)[is_scored])
+    row["psnr_floor"] = psnr((floor[:, None] - want)[is_scored])
+    inner = is_scored[5:-5, 5:-5]  # centres of whole windows
+    if inner.any():
         _, ssim = structural_similarity(
             got, want, channel_axis=2, data_range=1, gaussian_weights=True,
             use_sample_covariance=False, full=True)  # (H,W/2,3)
-        row["ssim"] = ssim[5:-5, 5:-5][is_scored[5:-5, 5:-5]].mean()
-    if lpips and side >= 32 and is_scored.any():
+        row["ssim"] = ssim[5:-5, 5:-5][inner].mean()
+    if lpips and min(is_scored.shape) >= 32:
         a, b = [torch.tensor(x).float().permute(2, 0, 1)[None] for x in (got, want)]  # (1,3,H,W)
         row["lpips"] = lpips(a, b, normalize=True).item()
     return row
 
 
-def evaluate(model, scene, lpips=None, folder=None):
-    """Scores of the test photos by the half-image protocol, per photo and on average, None
-    where there are none; codes (I,A) of all photos, those of test photos fitted. Writes each photo
-    with its render to the right of it into a folder, if one is given."""
+def evaluate(model, scene, lpips=None, pictures=None):
+    """Scores of the test photos by the half-image protocol, per photo and on average, None where
+    there are none; codes (I,A) of all photos, those of test photos fitted. The dictionary
+    `pictures` gets each photo with its render to the right of it, by name."""
     codes = model.codes().clone()
     for some in scene.test.split(32):
         codes[some] = fit_codes(model, scene, some)
     rows = []
     for photo in progress(scene.test.tolist(), "scoring held-out photos"):
+        name = str(scene.raw["name"][photo])
         rgb, truth, _, _ = render_photo(model, scene, photo, codes[photo])
         masked = photo_rays(scene, photo).is_masked.reshape(truth.shape[:2]).cpu().numpy()
-        name = str(scene.raw["name"][photo])
         rows.append(score(rgb, truth, masked, lpips) | dict(name=name))
-        if folder:
-            path = Path(folder, name.removesuffix(".png") + ".png")
-            if len(os.fsencode(path.name)) > 255:  # the most that file systems take
-                path = path.with_name(f"{path.name[:40]}~{zlib.crc32(os.fsencode(name)):08x}.png")
-            write_picture(path, lambda: to_uint8(np.hstack([truth, rgb])))
+        if pictures is not None:
+            pictures[name] = to_uint8(np.hstack([truth, rgb]))
     scores = dict(per_image=rows)
     for key in ("psnr", "psnr_floor", "ssim", "lpips"):
         values = [row[key] for row in rows if row[key] is not None]
@@ -1705,14 +1673,14 @@ def toy_truth(model, scene):
     """Errors of surface and mask that only a toy can tell: see data_prep.toy_truth."""
     near, wall = [torch.as_tensor(scene.raw[key]).to(scene.c2w) for key in ("near_wall", "wall")]
     _, gradient, _ = model.sdf.derivatives(wall, 0.004)
-    mask = None
+    sdf = model.distance(near)
+    M = None
     if model.has_mask:
-        masks = [
-            sample_logits(model.mask.logits([photo]), photo_rays(scene, photo).uv).sigmoid()
+        logits = [
+            sample_logits(model.mask.logits([photo]), photo_rays(scene, photo).uv)
             for photo in scene.train.tolist()]
-        mask = torch.cat(masks).cpu().numpy()
-    sdf = model.distance(near).cpu().numpy()
-    return data_prep.toy_truth(scene.raw, sdf, gradient.cpu().numpy(), mask)
+        M = torch.cat(logits).sigmoid().cpu().numpy()
+    return data_prep.toy_truth(scene.raw, sdf.cpu().numpy(), gradient.cpu().numpy(), M)
 
 
 def extract_mesh(model):
@@ -1753,14 +1721,6 @@ def mesh_colors(model, vertices):
     return in_chunks(colors, torch.as_tensor(x).to(scene.c2w)).cpu().numpy()
 
 
-def write_picture(path, draw):
-    """Writes the picture that draw() returns. One that fails is a line, not the end of a run."""
-    try:
-        write_png(path, draw())
-    except Exception as error:
-        print(f"  no {path.name}: {error!r:.200}")
-
-
 def depth_picture(depth, opacity):
     """Depth (H,W) as colours (H,W,3) of bytes: red is near, blue far, black where nothing is."""
     solid = depth[opacity > 0.5]
@@ -1794,6 +1754,14 @@ def draw_panel(model, scene, codes):
     return np.vstack(rows)
 
 
+def write_picture(path, draw):
+    """Writes the picture that draw() returns. One that fails is a line, not the end of a run."""
+    try:
+        write_png(path, draw())
+    except Exception as error:
+        print(f"  no {path.name}: {error!r:.200}")
+
+
 def film(model, scene, path):
     """VP9, which browsers play, at 24 frames/s: the first training camera sways sideways, by a
     tenth of the sphere's radius, while its photo's light turns into the last photo's."""
@@ -1815,8 +1783,7 @@ def film(model, scene, path):
         count = sum(1 for _ in iter(lambda: video.read()[0], False))
         check(count == FRAMES, f"{count} of {FRAMES} frames were written: make room in {folder}, "
               "or pip install --upgrade opencv-contrib-python-headless, which encodes VP9")
-        data = part.read_bytes()
-    atomic_write(path, lambda part: part.write_bytes(data))
+        atomic_write(path, lambda new: shutil.copyfile(part, new))
     print(f"wrote {path}")
 
 
@@ -1848,43 +1815,49 @@ def code_version():
 
 
 def finish(model, scene, state, run, processes=ALONE):
-    """Scores a trained model; writes codes, mesh, metrics and pictures below run. Returns the
-    metrics, and prints those that are one number with a fraction."""
+    """Scores a trained model; writes codes, mesh, metrics and at last pictures below run. Returns
+    the metrics, and prints those that are one number with a fraction."""
+    cfg = model.cfg
     is_metered = state.joules is not None
     is_cuda = scene.c2w.is_cuda
     threads = f"cpu, {torch.get_num_threads()} threads"
     buffers = [tensor for octree in model.octrees for tensor in octree.buffers()]
-    metrics = dict(
-        scene=scene.info["scene"],
-        method=model.name,
-        seed=model.cfg.seed,
-        steps=state.step,
-        device=torch.cuda.get_device_name() if is_cuda else threads,
-        train_seconds=state.seconds,
-        energy_wh=state.joules / 3600 if is_metered else None,
-        energy_source=f"the device's counter, read every {LOG_EVERY} s" if is_metered else None,
-        rays_per_second=processes.count * model.cfg.rays * state.step / state.seconds,
-        parameters=sum(p.numel() for p in model.parameters()),
-        model_bytes=sum(tensor.nbytes for tensor in [*model.parameters(), *buffers]),
-        peak_memory_bytes=peak_memory(is_cuda),  # before scoring
-        protocol="appearance fitted on the left half, scored on the right half",
-        has_mask=model.has_mask,
-        torch=torch.__version__,
-        commit=code_version(),
-        config=vars(model.cfg))
-    scores, codes = evaluate(model, scene, make_lpips(), run / "held_out")
-    metrics |= scores
+    memory = peak_memory(is_cuda)  # of training
+    pictures = {}
+    scores, codes = evaluate(model, scene, make_lpips(), pictures)
     atomic_write(run / "codes.npy", lambda part: np.save(part, codes.cpu()))
-    if model.octrees:  # baselines of test_geonvs.py have none
-        metrics["octree_cells"] = model.sdf.octree.cells[:, 0].bincount().tolist()  # by level
+    if model.octrees:  # rivals in test_geonvs.py have none
+        scores["octree_cells"] = model.sdf.octree.cells[:, 0].bincount().tolist()  # by level
         vertices, faces = extract_mesh(model)
         if len(faces) == 0:
             print(f"  {run}/mesh.ply is empty: no surface lies in the unit sphere; train longer")
         write_ply(run / "mesh.ply", vertices, faces, to_uint8(mesh_colors(model, vertices)))
         if "wall" in scene.raw:
-            metrics |= toy_truth(model, scene)
+            scores |= toy_truth(model, scene)
+    metrics = dict(
+        scene=scene.info["scene"],
+        method=model.name,
+        seed=cfg.seed,
+        steps=state.step,
+        device=torch.cuda.get_device_name() if is_cuda else threads,
+        train_seconds=state.seconds,
+        energy_wh=state.joules / 3600 if is_metered else None,
+        energy_source=f"the device's counter, read every {LOG_EVERY} s" if is_metered else None,
+        rays_per_second=processes.count * cfg.rays * state.step / state.seconds,
+        parameters=sum(p.numel() for p in model.parameters()),
+        model_bytes=sum(tensor.nbytes for tensor in [*model.parameters(), *buffers]),
+        peak_memory_bytes=memory,
+        protocol="appearance fitted on the left half, scored on the right half",
+        has_mask=model.has_mask,
+        torch=torch.__version__,
+        commit=code_version(),
+        config=vars(cfg),
+        **scores)
     atomic_write(run / "metrics.json", lambda part: part.write_text(json.dumps(metrics, indent=1)))
     write_picture(run / "panel.png", lambda: draw_panel(model, scene, codes))
+    for name, picture in pictures.items():
+        name = name.removesuffix(".png") + ".png"
+        write_picture(run / "held_out" / name, lambda: picture)
     for key, value in metrics.items():
         if isinstance(value, float):
             print(f"  {key} {value:.4g}")
@@ -1903,9 +1876,12 @@ def make_parser():
     for option in fields(Config):
         if option.name in GROUPS:
             group = parser.add_argument_group(GROUPS[option.name])
+        alone = option.metadata.get("alone")
         group.add_argument(
             f"--{option.name}",
             type=option.type,
+            nargs="?" if alone else None,
+            const=alone,
             metavar=option.type.__name__.upper(),
             default=argparse.SUPPRESS,  # for make_config, which has to know what was given
             help=f"{option.metadata['meaning']} [{option.default}]".removesuffix(" []"))
@@ -1938,6 +1914,7 @@ def main(argv=None):
         given.setdefault("minutes", 0.0)  # of two budgets the last one given
     cfg = make_config(given)
     name = f"{data_prep.scene_path(cfg.source).stem}-{GeoNVS.name}-{cfg.seed}"
+    name += "-paper" if cfg.paper else ""
     run = Path("runs", cfg.name or name)
     if render:
         model, scene, _ = load_run(run, **given)
@@ -1946,15 +1923,12 @@ def main(argv=None):
     saved = None
     if resume:
         saved, cfg = read_checkpoint(run / "checkpoint.pt", given)
-    for file in ("checkpoint.pt", "metrics.json", "log.jsonl"):
-        check(resume or not (run / file).exists(), f"{run} holds a run already: go on with it by "
-              "--resume, train beside it by --name NAME, or delete the folder to replace it")
+    check(resume or not run.exists(), f"{run} exists already: go on with it by --resume, train "
+          "beside it by --name NAME, or delete the folder to replace it")
     check(cfg.rays % cfg.photos == 0,
           f"--rays {cfg.rays} must be a multiple of --photos {cfg.photos}")
-    processes = ALONE
-    if os.environ.get("WORLD_SIZE", "1") != "1":  # torchrun says so
-        numbers = [os.environ.get(key, 0) for key in ("WORLD_SIZE", "RANK", "LOCAL_RANK")]
-        processes = Processes(*map(int, numbers))
+    numbers = dict(WORLD_SIZE=1, RANK=0, LOCAL_RANK=0) | os.environ  # as torchrun says
+    processes = Processes(*[int(numbers[key]) for key in ("WORLD_SIZE", "RANK", "LOCAL_RANK")])
     device = pick_device(cfg.device, processes)
     if processes.count > 1:
         processes.join(device)
@@ -1964,12 +1938,7 @@ def main(argv=None):
     scene = load_scene(read_scene(cfg), device)
     model, state = train(cfg, scene, run, saved, processes)
     if processes.is_first:
-        try:
-            finish(model, scene, state, run, processes)
-        except Exception as error:
-            check(not is_memory_full(error), "the memory is full, but the training is saved: end "
-                  "other programs, then go on with --resume")
-            raise
+        finish(model, scene, state, run, processes)
     if processes.count > 1:
         dist.destroy_process_group()
 
@@ -1977,6 +1946,7 @@ def main(argv=None):
 def run_command_line(entry):
     """Exit code 0, or 2 with one sentence on stderr; a bug keeps its traceback."""
     data_prep.allow_any_character()
+    go_on = "a run that has a checkpoint goes on with --resume"
     with on_signals(signal.default_int_handler):
         try:
             entry()
@@ -1984,15 +1954,14 @@ def run_command_line(entry):
         except UserError as error:
             message = str(error)
         except OSError as error:  # a full disk, a folder without permission
-            message = (f"{error}: make room, or choose another place or --name; a run that has a "
-                       "checkpoint goes on with --resume")
+            message = f"{error}: make room, or choose another place or --name; {go_on}"
         except KeyboardInterrupt as stop:
-            message = str(stop) or "stopped; a run that has a checkpoint goes on with --resume"
+            message = str(stop) or f"stopped; {go_on}"
         except Exception as error:
             if not is_memory_full(error):
                 raise
-            message = ("the memory is full: begin anew with fewer --rays or a larger --downscale; "
-                       "a run that has a checkpoint goes on with --resume")
+            message = ("the memory is full: end other programs, or begin anew with fewer --rays or "
+                       f"a larger --downscale; {go_on}")
     with contextlib.suppress(OSError):  # the terminal may be closed
         data_prep.warn(f"error: {message}")
     sys.exit(2)

@@ -2325,10 +2325,22 @@ def test_a_setting_has_a_least_value(name, least):
 
 
 @pytest.mark.parametrize("name, value", [
-    ("scene", "tower"), ("device", "tpu"), ("levels", 9), ("mask", "maybe")])
+    ("scene", "tower"), ("device", "tpu"), ("levels", 9), ("mask", "maybe"),
+    ("paper", "alpha,beta"), ("paper", "alpha lps")])
 def test_a_choice_is_one_of_those_that_are_named(name, value):
-    with pytest.raises(UserError, match=f"--{name} {value} is unknown: use one of .*, "):
+    with pytest.raises(UserError, match=f"--{name} {value} is unknown: use .*,"):
         geonvs.Config(**{name: value})
+
+
+@cases(
+    "flags, names",
+    none=([], []),
+    all=(["--paper"], list(geonvs.PRINTED)),
+    some=(["--paper", "alpha,lps"], ["alpha", "lps"]))
+def test_paper_chooses_printed_equations(flags, names):
+    given = geonvs.make_parser().parse_args(flags)
+    cfg = geonvs.Config(paper=getattr(given, "paper", ""))
+    assert [name for name in geonvs.PRINTED if cfg.printed(name)] == names
 
 
 @cases(
@@ -2394,10 +2406,6 @@ def read_log():
     return [json.loads(line) for line in (RUN / "log.jsonl").read_text().splitlines()]
 
 
-def logged_steps():
-    return [line["step"] for line in read_log()]
-
-
 def read_saved():
     saved, _ = geonvs.read_checkpoint(CHECKPOINT, {})
     return saved
@@ -2456,7 +2464,7 @@ def test_a_budget_in_minutes_replaces_steps(loop, monkeypatch):
     steps, done = zip(*[call.args[2:4] for call in loop.step.call_args_list])
     assert steps == tuple(range(15))
     assert_arrays_close(done, np.arange(15) / 15)
-    assert logged_steps() == [1, 4, 7, 10, 13, 15]  # every 30 s
+    assert [line["step"] for line in read_log()] == [1, 4, 7, 10, 13, 15]  # every 30 s
     assert_arrays_close(read_log()[0]["psnr"], 10)  # of the step's mse
     assert read_saved()["state"] == vars(state)
     flush.assert_called_with(True)  # vanishing numbers would be slow
@@ -2485,60 +2493,57 @@ def test_a_run_follows_its_seed(in_tmp_dir, whole):
     assert line["rgb"] != whole.log[0]["rgb"]
 
 
-def test_of_two_that_begin_at_once_one_goes_on(loop):
-    run_training()
-    with pytest.raises(FileExistsError, match="log.jsonl"):
-        run_training()
-    assert loop.step.call_count == 7  # the second one ended at its first checkpoint
-    assert read_saved()["state"]["step"] == 6
-
-
-def test_of_two_that_resume_at_once_one_goes_on(loop):
-    def other(model, optimizer, step, *others):
+def test_of_two_processes_in_a_folder_one_goes_on(loop):
+    def write_as_another(model, optimizer, step, *others):
         if step == 8:
             (RUN / "log.jsonl").write_text("a line of another process")
         return mock.DEFAULT
     run_training()
-    loop.step.side_effect = other
+    with pytest.raises(UserError, match="another process"):
+        run_training()  # both began at once
+    assert loop.step.call_count == 7  # the second one ended at its first checkpoint
+    assert read_saved()["state"]["step"] == 6
+    loop.step.side_effect = write_as_another
     with pytest.raises(UserError, match="another process"):
         run_training(read_saved(), steps=99)
     assert read_saved()["state"]["step"] == 7
 
 
 @cases(
-    "gaps, seconds",
+    "laps, seconds",
     none=([1.0] * 9, 9),
-    paused=([1.0, 1.0, 1.0, 600.0, 1.0], 5),
+    paused=([1.0, 1.0, 1.0, 600.0, 1.0], 24),
     short=([0.1, 0.1, 9.9], 10.1),  # seconds can be a checkpoint on a slow disk
     slow=([1.0, 1.0, 19.0], 21),
-    slow_from_the_start=([50.0, 60.0], 110))
-def test_a_pause_is_no_training(monkeypatch, gaps, seconds):
-    clock = itertools.accumulate([5.0, *gaps])
+    slower=([9.0, 60.0, 90.0], 159))
+def test_a_pause_counts_as_twenty_steps_at_most(loop, monkeypatch, laps, seconds):
+    clock = itertools.accumulate([5.0, *laps])
     monkeypatch.setattr(geonvs, "time", SimpleNamespace(perf_counter=clock.__next__))
-    laps = itertools.islice(geonvs.lap_times(), 1 + len(gaps))
-    assert sum(laps) == pytest.approx(seconds)
+    _, state = run_training(steps=len(laps))
+    assert state.seconds == pytest.approx(seconds)
 
 
-def test_a_checkpoint_holds_last_cache_and_no_photos(whole):
+def test_a_trained_model_has_a_fresh_cache(whole):
     cache = whole.model.cache
     wanted = whole.model.distance(cache.points(cache.inside)).detach()
-    values = whole.saved["model"]
     assert_same_tensors(cache.volume[0, 0].flatten()[cache.inside], wanted)
-    assert_same_tensors(cache.volume, values["cache.volume"])
-    assert {value.dtype for value in values.values()} == {torch.float32}
 
 
 def test_a_resumed_run_adds_to_what_was_spent(loop, monkeypatch):
     run_training()
-    (RUN / "metrics.json").touch()
     saved = read_saved()
     saved["state"].update(joules=100.0, seconds=1000.0)
+    results = [RUN / "metrics.json", RUN / "codes.npy"]
+    for path in results:
+        path.touch()
     monkeypatch.setattr(
         geonvs, "metered_joules", lambda _, joules, processes: itertools.count(joules, 3.0))
+    run_training(saved)  # nothing is left to be done
+    assert all(path.exists() for path in results)
     _, state = run_training(saved, steps=8)
     assert (state.step, state.seconds, state.joules) == (8, 1020, 106)
-    assert logged_steps() == [1, 4, 6, 7, 8]  # the first run ended at 6
-    assert not (RUN / "metrics.json").exists()
+    assert [line["step"] for line in read_log()] == [1, 4, 6, 7, 8]  # the first run ended at 6
+    assert not any(path.exists() for path in results)
 
 
 def start_child(function, **env):
@@ -2624,15 +2629,17 @@ def test_what_is_printed_comes_after_the_checkpoint(in_tmp_dir, monkeypatch, wor
     assert read_saved()["state"]["step"] == step
 
 
-def test_infinite_weights_end_a_run_before_its_checkpoint(loop):
+@pytest.mark.parametrize("paper", ["", "zeta"])
+def test_infinite_weights_end_a_run_before_its_checkpoint(loop, paper):
     def spoil(model, *others):
         if loop.step.call_count == 5:
             model.deviation.data.fill_(math.nan)
         return mock.DEFAULT
     loop.step.side_effect = spoil
-    with pytest.raises(UserError, match="learning rates.*checkpoint.pt"):
-        run_training(steps=99)
-    assert logged_steps() == [1, 4]
+    with pytest.raises(UserError, match="learning rates.*checkpoint.pt") as error:
+        run_training(steps=99, paper=paper)
+    assert ("printed equations may" in str(error.value)) == (paper != "")
+    assert [line["step"] for line in read_log()] == [1, 4]
     assert read_saved()["state"]["step"] == 4
 
 
@@ -2661,7 +2668,7 @@ def saved(in_tmp_dir, warm):
     """The dictionary of a checkpoint from before the first step."""
     optimizer = geonvs.make_optimizer(warm)
     terms = dict(mse=torch.tensor(0.1))
-    geonvs.save(RUN, warm, optimizer, generator(), geonvs.State(), terms, done=0.0)
+    geonvs.save(RUN, warm, optimizer, generator(), geonvs.State(), terms)
     return read_saved()
 
 
@@ -2691,7 +2698,7 @@ def test_photos_in_another_order_are_another_scene(scene):
 @cases(
     "key, value, says",
     of_a_gpu=("generator", torch.zeros(16).byte(), "kind of device"),
-    unknown_setting=("config", dict(lam_old=1.0), "does not know.*lam_old"))
+    unknown_setting=("config", dict(lam_old=1.0), "version.*lam_old"))
 def test_a_checkpoint_of_something_else_is_refused(saved, warm, key, value, says):
     torch.save(saved | {key: value}, CHECKPOINT)
     with pytest.raises(UserError, match=says):
@@ -2710,8 +2717,18 @@ def test_a_checkpoint_fits_its_own_settings_alone(saved, scene):
             geonvs.restore(saved, make_model(scene, **settings))
 
 
+def start_pair(function):
+    """Two processes as torchrun starts them; what they print."""
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = str(free.getsockname()[1])
+    env = dict(MASTER_ADDR="127.0.0.1", MASTER_PORT=port, WORLD_SIZE="2")
+    pair = [start_child(function, RANK=rank, LOCAL_RANK=rank, **env) for rank in "01"]
+    return [process.communicate(timeout=600)[0] for process in pair]
+
+
 def train_as_one_of_two():
-    """Trains for a minute on its own clock; saves weights, pixels and a mean of gradients."""
+    """Trains for a minute on its own clock, then once more until the second process has an infinite
+    gradient. Saves weights, pixels, a mean of gradients, and what is said about infinity."""
     rank = int(os.environ["RANK"])
     processes = geonvs.Processes(2, rank, rank)
     processes.join(CPU)
@@ -2722,59 +2739,36 @@ def train_as_one_of_two():
     # as if errors differed between processes, which they do on GPUs
     patch.setattr(geonvs, "cells_to_split", lambda octree: octree.cells[9 * rank:][:9])
     model, _ = run_training(processes=processes, minutes=1.0, steps=99)
-    pixels = [call.args[2] for call in make_rays.call_args_list]
+    pixels = torch.cat([call.args[2] for call in make_rays.call_args_list])
+    weights = dict(model.named_parameters())
+    weights["split"] = model.sdf.octree.split_keys
     layer = nn.Linear(2, 1)
     layer.weight.grad = torch.tensor([[1.0, 5.0]]) + rank
     layer.bias.grad = torch.tensor([9.0])
     processes.average_gradients(layer)
-    weights = dict(model.named_parameters())
-    weights["split"] = model.sdf.octree.split_keys
-    torch.save((weights, torch.cat(pixels), layer.weight.grad), f"{rank}.pt")
+    losses = geonvs.GeoNVS.losses
 
-
-def start_pair(function):
-    """Two processes as torchrun starts them; what they print."""
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        port = str(free.getsockname()[1])
-    env = dict(MASTER_ADDR="127.0.0.1", MASTER_PORT=port, WORLD_SIZE="2")
-    pair = [start_child(function, RANK=rank, LOCAL_RANK=rank, **env) for rank in "01"]
-    return [process.communicate(timeout=600)[0] for process in pair]
+    def spoil(model, *args):
+        loss, *others = losses(model, *args)
+        return loss * (math.inf if rank == 1 else 1.0), *others
+    patch.setattr(geonvs.GeoNVS, "losses", spoil)
+    with pytest.raises(UserError) as error:
+        run_training(read_saved(), processes, minutes=99.0)
+    torch.save((weights, pixels, layer.weight.grad, str(error.value)), f"{rank}.pt")
 
 
 def test_two_processes_train_one_model(in_tmp_dir):
     said, silence = start_pair("train_as_one_of_two")
     assert "step 16" in said
     assert silence == ""
-    a, pixels_a, grad = torch.load("0.pt")
-    b, pixels_b, _ = torch.load("1.pt")
+    a, pixels_a, grad, error_a = torch.load("0.pt")
+    b, pixels_b, _, error_b = torch.load("1.pt")
     assert_same_tensors(a, b)
     assert len(pixels_a) == len(pixels_b) == 16 * 64  # until the first process says so
     assert (pixels_a == pixels_b).float().mean() < 0.1  # each draws its own rays
     assert grad.tolist() == [[1.5, 5.5]]  # the means of 1 and 2, of 5 and 6
-
-
-def diverge_as_one_of_two():
-    """Trains; the gradient of the second process gets infinite. Saves what is said about it."""
-    rank = int(os.environ["RANK"])
-    processes = geonvs.Processes(2, rank, rank)
-    processes.join(CPU)
-    patch = pytest.MonkeyPatch()
-    pass_time(patch, seconds=10)
-    losses = geonvs.GeoNVS.losses
-
-    def spoil(model, *args):
-        loss, terms, out = losses(model, *args)
-        return loss * (math.inf if rank == 1 and model.zeta() > 0 else 1.0), terms, out
-    patch.setattr(geonvs.GeoNVS, "losses", spoil)
-    with pytest.raises(UserError) as error:
-        run_training(processes=processes, steps=99)
-    Path(f"{rank}.txt").write_text(str(error.value))
-
-
-def test_all_processes_notice_a_divergence(in_tmp_dir):
-    start_pair("diverge_as_one_of_two")
-    for rank in "01":
-        assert "no longer finite" in Path(f"{rank}.txt").read_text()
+    assert error_a == error_b
+    assert "no longer finite" in error_a  # both noticed it
 
 
 def test_several_processes_count_all_seconds(loop, monkeypatch):
@@ -2879,7 +2873,7 @@ def test_masked_pixels_are_left_out_of_codes_and_scores(knowing, scene):
     rgb[masked] = 255
     scene = geonvs.load_scene(scene.raw | dict(rgb=rgb, masked=masked))
     codes = random(8, 3)
-    painter = SimpleNamespace(codes=lambda: codes, render=lambda rays, code: dict(
+    painter = SimpleNamespace(cfg=tiny(), codes=lambda: codes, render=lambda rays, code: dict(
         rgb=code, normal=code, depth=code[:, 0]))
     scores, codes = geonvs.evaluate(painter, scene)
     assert_arrays_close(codes[scene.test], 7 / 255, atol=0.01)  # none of the white
@@ -2904,30 +2898,30 @@ def knowing(warm):
     return warm
 
 
-def test_a_model_that_knows_photos_scores_perfectly(knowing, scene, tmp_path):
-    scores, codes = geonvs.evaluate(knowing, scene, folder=tmp_path)
+def test_a_model_that_knows_photos_scores_perfectly(knowing, scene):
+    pictures = {}
+    scores, codes = geonvs.evaluate(knowing, scene, pictures=pictures)
     rows = scores["per_image"]
     names = scene.raw["name"][scene.raw["is_test"]].tolist()
     is_same = (codes == knowing.codes()).all(1)
     assert scores["psnr"] == pytest.approx(100)  # no score is higher
     assert scores["psnr_floor"] == np.mean([row["psnr_floor"] for row in rows])
-    assert [row["name"] for row in rows] == names
+    assert [row["name"] for row in rows] == list(pictures) == names
     assert torch.equal(is_same.nonzero()[:, 0], scene.train)  # codes of test photos are fitted
-    assert sorted(os.listdir(tmp_path)) == names
-    left, right = np.hsplit(cv2.imread(str(tmp_path / names[0]))[:, :, ::-1], 2)
+    left, right = np.hsplit(pictures[names[0]], 2)
     assert np.array_equal(left, photo(scene.raw, scene.test[0].item()))
     assert np.array_equal(right[:, -9:], left[:, -9:])  # the model knows the right half
     scores, _ = geonvs.evaluate(knowing, scene._replace(test=scene.test[:0]))
-    assert scores.pop("per_image") == []
-    assert set(scores.values()) == {None}
+    assert scores == dict(
+        per_image=[], psnr=None, psnr_floor=None, ssim=None, lpips=None, masked_pixels=0)
 
 
-@pytest.mark.parametrize("letters", ["a" * 246, "a" * 250, "ä" * 125])
-def test_photos_with_long_names_have_pictures(knowing, scene, tmp_path, letters):
-    names = np.array([f"deep/{letters}{i}.jpg" for i in range(8)])  # of up to 255 bytes
-    scene = scene._replace(raw=scene.raw | dict(name=names))
-    geonvs.evaluate(knowing, scene, folder=tmp_path)
-    assert len(list(tmp_path.glob("deep/*.png"))) == 2
+@pytest.mark.parametrize("paper, says", [("", "finite: "), ("alpha", "printed equations may")])
+def test_infinite_colours_are_no_picture(knowing, scene, paper, says):
+    knowing.cfg.paper = paper
+    knowing.render = lambda rays, code: dict(rgb=code[:, :3], normal=rays.d, depth=rays.uv[:, 0])
+    with pytest.raises(UserError, match=says):
+        geonvs.render_photo(knowing, scene, 1, torch.tensor([0.5, 0.5, math.nan, 0.0]))
 
 
 def test_a_rendered_photo_has_its_pixels_in_order(knowing, scene):
@@ -3146,10 +3140,12 @@ def assert_refused(answer, word):
     assert re.fullmatch(f".*error: .*{re.escape(word)}.*\n", error)
 
 
-def test_one_command_trains_scores_and_writes_everything(finished):
+def test_one_command_trains_scores_and_writes_everything(finished, scene):
     metrics = json.loads((finished / "metrics.json").read_text(), parse_constant=pytest.fail)
-    files = {"checkpoint.pt", "log.jsonl", *geonvs.RESULTS, "held_out"}
-    assert set(os.listdir(finished)) == files - {"film.mp4"}
+    assert set(os.listdir(finished)) == {
+        "checkpoint.pt", "log.jsonl", "metrics.json", "codes.npy", "panel.png", "mesh.ply",
+        "held_out"}
+    assert sorted(os.listdir(finished / "held_out")) == scene.raw["name"][scene.raw["is_test"]].tolist()
     assert metrics["config"] == asdict(tiny(seed=3, mask="on"))
     assert metrics["energy_wh"] in range(2, 8)  # one at the start, one for each line of the log
     assert metrics["rays_per_second"] == pytest.approx(6 * 64 / metrics["train_seconds"])
@@ -3265,28 +3261,21 @@ def test_a_trained_run_outlives_full_memory(command, monkeypatch, part):
     with monkeypatch.context() as patch:
         fail = mock.Mock(side_effect=RuntimeError("can't allocate memory"))
         patch.setattr(geonvs, part, fail)
-        assert_refused(command(FLAGS), "training is saved")
+        assert_refused(command(FLAGS), "--resume")
     assert command("--resume --name=b") == (0, "")
     assert Path("runs/b/metrics.json").exists()
 
 
 def test_a_picture_that_fails_is_one_line(command, monkeypatch, capsys):
-    write_png = geonvs.write_png
-    first, second = sorted(os.listdir(RUN / "held_out"))
-
-    def write(path, picture):
-        if path.name == first:
-            raise UserError("no room")
-        write_png(path, picture)
-    monkeypatch.setattr(geonvs, "write_png", write)
+    names = np.array([f"deep/{n * 'a'}.jpg" for n in range(241, 249)])  # the last one is too long
+    data_prep.write_scene(Path("data/toy.npz"), toy() | dict(name=names, is_test=names >= names[6]))
     monkeypatch.setattr(geonvs, "draw_panel", mock.Mock(side_effect=MemoryError("full")))
     geonvs.run_command_line(lambda: geonvs.main(FLAGS.split()))
     lines = capsys.readouterr().out.splitlines()
     missing = [line.split(":")[0] for line in lines if line.startswith("  no ")]
-    files = os.listdir("runs/b")
-    assert missing == [f"  no {first}", "  no panel.png"]
-    assert {"metrics.json", "mesh.ply", "codes.npy"} < set(files)
-    assert os.listdir("runs/b/held_out") == [second]
+    assert missing == ["  no panel.png", f"  no {248 * 'a'}.jpg.png"]
+    assert {"metrics.json", "mesh.ply", "codes.npy"} < set(os.listdir("runs/b"))
+    assert os.listdir("runs/b/held_out/deep") == [f"{247 * 'a'}.jpg.png"]
 
 
 def test_a_fault_of_the_program_keeps_its_traceback():
