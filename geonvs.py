@@ -1938,7 +1938,12 @@ def main(argv=None):
     scene = load_scene(read_scene(cfg), device)
     model, state = train(cfg, scene, run, saved, processes)
     if processes.is_first:
-        finish(model, scene, state, run, processes)
+        try:
+            finish(model, scene, state, run, processes)
+        except Exception as error:
+            check(not is_memory_full(error), "the memory is full, but the training is saved: end "
+                  "other programs, then go on with --resume")
+            raise
     if processes.count > 1:
         dist.destroy_process_group()
 
@@ -1960,8 +1965,8 @@ def run_command_line(entry):
         except Exception as error:
             if not is_memory_full(error):
                 raise
-            message = ("the memory is full: end other programs, or begin anew with fewer --rays or "
-                       f"a larger --downscale; {go_on}")
+            message = ("the memory is full: begin anew with fewer --rays or a larger --downscale; "
+                       + go_on)
     with contextlib.suppress(OSError):  # the terminal may be closed
         data_prep.warn(f"error: {message}")
     sys.exit(2)
