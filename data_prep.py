@@ -663,36 +663,33 @@ def open_model(folder, sparse):
     return max(models, key=lambda model: len(model.files))
 
 
-def find_model(folder, command):
-    """The model in the folder with most photos; prints which photos and models it lacks.
-
-    command: how a model is made, for messages
-    """
+def find_model(folder):
+    """The model in the folder with most photos; prints which photos and models it lacks."""
     models = []
     for path in files_below(folder):
         if os.path.isdir(path):
             warn(f"passed over: the folder {path} may not be read")
         if path.name == "images.bin":
             models.append(open_model(folder, path.parent))
+    sfm = f"python data_prep.py {folder} --sfm"
     parent = folder.absolute().parent
     if not models and folder.name in ("images", "input"):
         around = [path.name for path in files_below(parent)]
         check("images.bin" not in around,
               f"{folder} has no COLMAP model, the folder around it has: give {parent}")
     check(models,
-          f"{folder} has no binary COLMAP model: run {command}, or for a text model "
+          f"{folder} has no binary COLMAP model: run {sfm}, or for a text model "
           "colmap model_converter --output_type BIN")
     best = max(models, key=lambda model: model.count)
-    check(best.photos,
-          f"{best.sparse} is an empty model, no photo is posed: delete it and run {command}")
+    check(best.photos, f"{best.sparse} is an empty model: delete it and run {sfm}")
     lost = sorted(best.photos.keys() - best.files)
     if lost:
         hint = name_hint(lost[0], best.on_disk)
         message = f"{len(lost)} photos of {best.sparse} are not on disk, such as {lost[0]!r}{hint}"
-        check(best.files, f"{message}: put them into {folder / 'images'}, or run {command}")
+        check(best.files, f"{message}: put them into {folder / 'images'}, or run {sfm}")
         warn(message)
-    on_disk = max(len(model.on_disk) for model in models)
-    print(f"{best.images}: {on_disk} photos on disk, {len(best.files)} posed by {best.sparse}")
+    count = len(best.on_disk)
+    print(f"{best.images}: {count} photos on disk, {len(best.files)} posed by {best.sparse}")
     for model in models:
         if model.photos.keys() != best.photos.keys():
             print(f"left out is another model: {len(model.photos)} posed by {model.sparse}")
@@ -700,19 +697,23 @@ def find_model(folder, command):
 
 
 def read_table(path):
-    """Lines of a table of any separator, as lists of words."""
+    """Rows of a table of any separator as dictionaries; of a list train*.txt or test*.txt, too."""
     check(path.is_file(), f"the split file {path} is missing")
     text = path.read_text("utf-8-sig", "surrogateescape")
-    lines = [line for line in text.splitlines() if line.strip()] or [""]
-    separator = max("\t;,", key=lines[0].count)
-    return [[word.strip(' "') for word in line.split(separator)] for line in lines]
+    lines = [line for line in text.splitlines() if line.strip()]
+    if path.suffix == ".txt":
+        subset = "test" if "test" in path.name else "train"
+        return [dict(filename=line.strip(), split=subset) for line in lines]
+    separator = max("\t;,", key="".join(lines[:1]).count)
+    words = [[word.strip(' "') for word in line.split(separator)] for line in lines]
+    return [dict(zip(words[0], row)) for row in words[1:]]
 
 
 def split_files(folder, split):
     """The table of the split, or train_list.txt and test_list.txt: named or in the folder."""
     found = [Path(split)] if split else [
         path for path in sorted(folder.glob("[!.]*.[ct]sv"))
-        if os.access(path, os.R_OK) and "split" in read_table(path)[0]
+        if os.access(path, os.R_OK) and any("split" in row for row in read_table(path))
     ] or list(folder.glob("train*.txt"))
     check(len(found) < 2, f"choose a split file by --split: {', '.join(map(str, found))}")
     if found and found[0].suffix == ".txt":
@@ -727,30 +728,18 @@ def read_split(paths, names):
     A table has NeRF-W's columns; rows with an empty id do not count.
     """
     print(f"split by {paths[0]}")
-    if len(paths) == 2:
-        rows = [
-            dict(filename=words[0], split=subset)
-            for subset, path in zip(("train", "test"), paths)
-            for words in read_table(path)
-        ]
-    else:
-        head, *lines = read_table(paths[0])
-        check({"filename", "split"} <= set(head),
-              f"{paths[0]} needs a header with filename and split")
-        rows = [dict(zip(head, line)) for line in lines]
     subsets = {}
-    for row in rows:
+    for row in itertools.chain(*map(read_table, paths)):
         name, subset = row.get("filename"), row.get("split")
         if row.get("id") != "":
             is_clear = subset in ("train", "test") and subsets.setdefault(name, subset) == subset
             check(name and is_clear,
-                  f"{paths[0]}: {name!r} is {subset!r}; each is train or test, and not both")
+                  f"{paths[0]}: filename {name!r} has split {subset!r}; each has train or test")
     matches = match_names(subsets, names)
-    is_held_out = {matches.get(name, name): subset == "test" for name, subset in subsets.items()}
-    rest = set(names) - is_held_out.keys()
+    rest = set(names) - set(matches.values())
     if rest:
         warn(f"{len(rest)} photos are not in {paths[0]}: {min(rest)} ...")
-    return is_held_out
+    return {matches.get(name, name): subset == "test" for name, subset in subsets.items()}
 
 
 def checksum(paths):
@@ -949,9 +938,8 @@ def check_sphere(scene):
              "in a room: expect poor geometry; this method is for a landmark seen from outside")
 
 
-def read_folder(folder, command, downscale, split):
-    """The scene of a folder; command: how a model is made, for messages."""
-    model = find_model(folder, command)
+def read_folder(folder, downscale, split):
+    model = find_model(folder)
     info = dict(
         scene=folder.resolve().name,
         kind="colmap",
@@ -982,14 +970,13 @@ def read_folder(folder, command, downscale, split):
 def prepare(name, downscale=2, split=None):
     """Scene of one of SCENES, or of a folder with photos and a COLMAP model; see FORMAT."""
     folder = Path(name)
-    command = f"python data_prep.py {name} --sfm"
     if name in SCENES:
         folder = DATA / name
-        command = f"python data_prep.py {name} --download"
         if not folder.is_dir():
             folder = DATA / SCENES[name][0]
+        check(folder.is_dir(), f"{folder} is missing: run python data_prep.py {name} --download")
     try:
-        return read_folder(folder, command, downscale, split and os.path.abspath(split))
+        return read_folder(folder, downscale, split and os.path.abspath(split))
     except (MemoryError, cv2.error) as e:
         if not is_memory_full(e):
             raise
@@ -1424,7 +1411,7 @@ def make_toy(seed=0, size=96, photos=48, test=8, occluders=0.05, exposure=1.0,
     turn = np.radians(sun_rng.uniform(-sun, sun, count))  # of the sun
     weather = sky_rng.uniform(-sky, sky, (count, 4))
     parts = toy_parts(landmark, background)
-    photos, depth, surface, occluder = [], [], [], []
+    taken, depth, surface, occluder = [], [], [], []
     for i in progress(numbers, "drawing photos"):
         camera = toy_camera(camera_rng, np.radians(azimuth[i]), size)
         K, c2w, w, h = camera
@@ -1441,20 +1428,20 @@ def make_toy(seed=0, size=96, photos=48, test=8, occluders=0.05, exposure=1.0,
         srgb = np.clip(linear * gain, 0, 1) ** (1.2 ** contrast / 2.2)
         image = (srgb * 255 + 0.5).astype(np.uint8).reshape(h, w, 3)
         masked = np.zeros((h, w), bool)
-        photos.append(Photo(f"toy_{i:03d}.png", image, masked, K, c2w, None, is_test[i]))
+        taken.append(Photo(f"toy_{i:03d}.png", image, masked, K, c2w, None, is_test[i]))
         d = ray_directions(*camera)
         t, _ = trace(o, d, parts)
         depth.append(t)
         surface.append(o + t[:, None] * d)
         occluder.append(people[:, 3] > 0)
     seen = [np.where(people, np.inf, t) for people, t in zip(occluder, depth)]
-    points = toy_points(sfm_rng, photos, surface, seen)
-    for photo in photos:
+    points = toy_points(sfm_rng, taken, surface, seen)
+    for photo in taken:
         add_pose_noise(pose_rng, photo.K, photo.c2w, pose_noise * (not photo.is_test))
         photo.c2w[:, 3] = photo.c2w[:, 3] * TOY_SCALE + TOY_ORIGIN
     signs = np.array(list(itertools.product((-1, 1), repeat=3)))
     corners = [part.center + part.half * signs for part in toy_parts(landmark, background=False)]
-    scene = build_scene(photos, points, info, np.array(corners) * TOY_SCALE + TOY_ORIGIN)
+    scene = build_scene(taken, points, info, np.array(corners) * TOY_SCALE + TOY_ORIGIN)
     scene["depth"] = np.float16(np.concatenate(depth) * TOY_SCALE / scene["scale"])
     scene["occluder"] = np.concatenate(occluder)
     some = np.concatenate(surface)[::9]  # every ninth pixel; sky is infinite and drops out
@@ -1609,17 +1596,6 @@ def write_sfm_masks(files, masks, folder):
             warn(f"{name} {e}")
 
 
-def import_pycolmap():
-    install = 'run pip install "pycolmap>=3.13"'
-    try:
-        import pycolmap  # an extra
-    except ImportError as e:
-        raise UserError(f"--sfm needs pycolmap ({e}): {install}") from e
-    check(hasattr(pycolmap, "FeatureExtractionOptions"),
-          f"pycolmap {pycolmap.__version__} is too old: {install}")
-    return pycolmap
-
-
 def run_sfm(folder):
     """Finds the poses of the raw photos in `folder` by pycolmap -> folder/sparse/{0,1,...}
 
@@ -1633,18 +1609,21 @@ def run_sfm(folder):
           f"{folder} has sparse/ or dense/, a model: leave --sfm out, or delete that")
     files = sfm_photos(images)
     masks = mask_files(images, files)
-    pycolmap = import_pycolmap()
+    try:
+        import pycolmap  # an extra
+        reader = pycolmap.ImageReaderOptions()
+        features = pycolmap.FeatureExtractionOptions()
+        matching = pycolmap.FeatureMatchingOptions()
+    except (ImportError, AttributeError) as e:  # missing, or too old
+        raise UserError(f'--sfm needs pycolmap ({e}): run pip install "pycolmap>=3.13"') from e
     work = DATA / f"sfm-{checksum([*files.values(), *masks.values()]):08x}"
     database = work / "database.db"
     (work / "masks").mkdir(parents=True, exist_ok=True)
     write_sfm_masks(files, masks, work / "masks")
-    reader = pycolmap.ImageReaderOptions()
     reader.mask_path = work / "masks"
     # Of 135 photos of a statue in all lights these options pose 104 in one model, not 60.
-    features = pycolmap.FeatureExtractionOptions()
     features.sift.estimate_affine_shape = True
     features.sift.domain_size_pooling = True
-    matching = pycolmap.FeatureMatchingOptions()
     matching.guided_matching = True
     with tempfile.TemporaryDirectory(prefix=".sparse", dir=folder) as temporary:
         models = Path(temporary, "models")
