@@ -1371,7 +1371,7 @@ def test_sfm_calls_pycolmap_in_order(pycolmap):
 def test_a_second_sfm_takes_up_the_first(pycolmap):
     put(MASKS / "toy_000.png", encoded(BLACK_LEFT))
     put(MASKS / "toy_001.png", "no image")
-    put(IMAGES / "toy_002.png", with_alpha(".png"))
+    put(IMAGES / "toy_003.png", with_alpha(".png"))
     works = pycolmap.incremental_mapping.side_effect
     pycolmap.incremental_mapping.side_effect = OSError(28, "No space left")
     assert_error("No space left", "place --sfm")
