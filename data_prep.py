@@ -10,8 +10,8 @@ Scene files. A scene is one .npz of the arrays in FORMAT, below; some have those
 The landmark lies in the unit sphere. A ray is c2w[:, 3] + t * d with |d| = 1; a distance
 is this t, never a z-depth. x right, y down, z forward are a camera's axes, as in OpenCV.
 
-Masks. masks/ lies in the folder of photos or beside it; there the mask of photo.jpg is
-photo.png, photo.jpg.png or photo.jpg. Pixels darker than 128 are left out, and so are
+Masks. masks/ or MASKS/ lies in the folder of photos or beside it; there the mask of photo.jpg
+is photo.png, photo.jpg.png or photo.jpg. Pixels darker than 128 are left out, and so are
 pixels whose alpha channel is below 128, in a photo or a mask. A point that most photos
 see in such pixels is dropped.
 
@@ -317,6 +317,7 @@ def find_sphere(x, weight, photos, contain):
 
 
 def count_sightings(photos, points):
+    """How many of the photos see each point. -> (P,)"""
     return np.bincount(np.concatenate([photo.track for photo in photos]), minlength=len(points))
 
 
@@ -338,9 +339,8 @@ def build_scene(photos, points, info, contain=()):
     usable = is_there & (track_length >= 3)
     if usable.sum() < 500:
         usable = is_there & (track_length >= 2)
-    check(usable.sum() >= 20,
-          f"{usable.sum()} usable 3D points: SfM needs more overlapping photos, or masks cover "
-          "too much")
+    count = usable.sum()
+    check(count >= 20, f"{count} usable 3D points: take more overlapping photos, or mask less")
     usable &= error <= np.quantile(error[usable], 0.95)
     new_index = np.cumsum(usable) - 1
     for photo in photos:
@@ -449,9 +449,7 @@ OPENCV_DISTORTION = "k1 k2 p1 p2 k3 k4 k5 k6".split()
 
 def records(path):
     """Yields, for each record of a COLMAP file, a function that reads values by a layout."""
-    check(path.is_file(),
-          f"{path} is missing: copy the whole model, or for points run "
-          "colmap point_triangulator")
+    check(path.is_file(), f"{path} is missing: copy the model, or run colmap point_triangulator")
     file = io.BytesIO(path.read_bytes())
 
     def read(layout):
@@ -509,11 +507,10 @@ def check_photo(camera, pose, is_test):
     numbers = np.concatenate([K, distortion, pose])
     is_sound = (abs(numbers) < MAX_NUMBER).all() and min(K[:2]) > EPSILON and pose[:4].any()
     check(is_sound, "has no sound camera or pose: run SfM again")
-    check(max(wh) < 32767,
-          f"is {wh[0]} x {wh[1]} pixels, too large for OpenCV: shrink it, then run SfM again")
+    w, h = wh
+    check(max(wh) < 32767, f"is {w} x {h} pixels, too large: shrink it, then run SfM again")
     angle = 2 * np.degrees(np.arctan(max(wh / K[:2]) / 2))
-    check(is_test or 10 <= angle <= 120,
-          f"is {angle:.1f} degrees wide, which is not in 10..120")
+    check(is_test or 10 <= angle <= 120, f"is {angle:.1f} degrees wide, which is not in 10..120")
 
 
 def camera_to_world(pose):
@@ -535,8 +532,8 @@ def read_points(sparse):
     points = np.array(points, float).reshape(-1, 5)
     # A row with nan or a huge number becomes 0; build_scene drops points of track length 0.
     points[~(abs(points) < MAX_NUMBER).all(1)] = 0
-    check((points[:, 4] > 1).any(),
-          f"no point of {sparse} has a track: run colmap point_triangulator on it")
+    has_track = points[:, 4] > 1
+    check(has_track.any(), f"no point of {sparse} has a track: run colmap point_triangulator")
     return points, rows
 
 
@@ -753,11 +750,12 @@ def checksum(paths):
 
 
 def fingerprint(info):
-    """Checksum of the files that a scene is read from: models, split tables, photos, masks."""
+    """Checksum of the files a scene is read from: models, split tables, posed photos, masks."""
     folder, images = Path(info["folder"]), Path(info["images"])
     paths = [path for path in files_below(folder) if path.name in MODEL_FILES]
     paths += split_files(folder, info["split"])
-    paths += photo_files(images).values()
+    photos = photo_files(images, info["posed"])
+    paths += [photos[name] for name in sorted(match_names(info["posed"], photos).values())]
     for masks in mask_folders(images):
         paths += files_below(masks)
     return checksum(paths)
@@ -799,8 +797,7 @@ def read_image(path, flags):
         if is_memory_full(e):
             raise MemoryError("the memory is full: use smaller photos") from e
         image = None
-    check(image is not None,
-          "is empty, damaged, too large or no photo of a known type: replace it")
+    check(image is not None, "is empty, damaged, too large or of an unknown type: replace it")
     return image
 
 
@@ -820,8 +817,7 @@ def read_photo(path, size):
 def shrink(image, camera, downscale):
     """Undistorts and downscales a photo (h,w,3) or a mask (h,w). -> it, K (4,)"""
     size, K, distortion = camera
-    check(1 <= downscale <= min(size) / 2,
-          f"is {size[0]} x {size[1]}: choose another --downscale")
+    check(1 <= downscale <= min(size) / 2, f"is {size[0]} x {size[1]}: change --downscale")
     if distortion.any():
         fx, fy, cx, cy = K - (0, 0, 0.5, 0.5)  # OpenCV's first pixel is at 0
         M = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
@@ -898,10 +894,9 @@ def read_usable(model, points, rows, is_held_out, downscale):
             track = np.array([rows[key] for key in ids if key in rows], int)
             uv, _ = project(K, c2w, points[track, :3])
             is_inside = is_in_photo(uv, image.shape[1::-1])
-            is_misfit = 2 * is_inside.sum() < len(track)
-            misfits += is_misfit
-            check(not is_misfit,
-                  f"shows {is_inside.mean():.0%} of its points: wrong pose or distortion")
+            share = is_inside.mean() if len(track) else 1
+            misfits += share < 0.5
+            check(share >= 0.5, f"shows {share:.0%} of its points: wrong pose or distortion")
         except UserError as e:
             warn(f"left out: {name} {e}")
             if is_test:
@@ -946,6 +941,7 @@ def read_folder(folder, downscale, split):
         downscale=downscale,
         folder=str(folder),
         images=str(model.images),
+        posed=sorted(model.photos),
         split=split)
     info["files"] = fingerprint(info)
     tables = split_files(folder, split)
@@ -1009,10 +1005,8 @@ def open_scene(name_or_folder, downscale=2):
         if info["downscale"] == downscale and (is_gone or info["files"] == fingerprint(info)):
             return scene
     print(f"making {path}")
-    if name_or_folder == "toy":
-        scene = make_toy()
-    else:
-        scene = prepare(name_or_folder, downscale, split)
+    is_toy = name_or_folder == "toy"
+    scene = make_toy() if is_toy else prepare(name_or_folder, downscale, split)
     write_scene(path, scene)
     return scene
 
@@ -1589,11 +1583,12 @@ def write_sfm_masks(files, masks, folder):
     for name, path in progress(files.items(), "looking for masks"):
         try:
             photo = read_image(path, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-            mask = read_mask(path, masks.get(name), photo.shape[1::-1])
-            if not mask.all():
-                write_png(folder / f"{name}.png", np.stack([mask] * 3, axis=-1))
         except UserError as e:
             warn(f"{name} {e}")
+            continue
+        mask = read_mask(path, masks.get(name), photo.shape[1::-1])
+        if not mask.all():
+            write_png(folder / f"{name}.png", np.stack([mask] * 3, axis=-1))
 
 
 def run_sfm(folder):

@@ -399,8 +399,9 @@ def test_a_sighting_is_masked_by_its_own_pixel():
     u, v, _ = (20 * x + (20, 10, 0)).T
     track = np.arange(0, 300, 2)
     photo = black_photo(track, mask, K=(20, 20, 20, 10))
-    data_prep.drop_masked([photo], x)
+    is_kept = data_prep.drop_masked([photo, black_photo(track, 0 * mask)], x)
     assert np.array_equal(photo.track, track[~((u > 30) & (v > 5))[track]])
+    assert is_kept.all()  # half of the sightings are enough
 
 
 def test_near_footprint_and_sightings_follow_the_points():
@@ -756,7 +757,7 @@ def dangle(model):
     panorama=(change("cameras", 0, [1, 33000, 9, 99, 99, 9, 9]), "is 33000 x 9 pixels, too large"),
     wrong_pose=(change("poses", (0, 4), 99), "shows 0% of its points"),
     folding=(change("cameras", 0, [2, 24, 32, 26, 12, 16, 300]), "wrong pose or distortion"),
-    empty=(new(PHOTO, b""), "is empty, damaged, too large or no photo"),
+    empty=(new(PHOTO, b""), "is empty, damaged, too large or of an unknown type"),
     heic=(new(PHOTO, HEIC), "is HEIC, which cannot be read"),
     cut_png=(new(PHOTO, encoded(BLACK)[:-20]), "is cut off"),
     cut_jpeg=(new(PHOTO, encoded(BLACK, ".jpg")[:-20]), "is cut off"),
@@ -787,7 +788,7 @@ def test_a_photo_of_an_unknown_type_is_named(model):
     TABLE.unlink()
     scene, out, err = made()
     assert "8 photos on disk, 8 posed" in out
-    assert err.startswith("left out: toy_000.dng is empty, damaged, too large or no photo")
+    assert err.startswith("left out: toy_000.dng is empty, damaged, too large or of an unknown type")
 
 
 def test_bad_photos_are_found_in_one_go(model):
@@ -976,6 +977,7 @@ def touch_all(model):
     hidden_file=(new("place/.DS_Store"), False),
     notes=(new("place/notes.txt"), False),
     table_without_split=(new("place/notes.csv"), False),
+    photo_without_pose=(new(IMAGES / "without_pose.png"), False),
     sources_gone=(move(Path("place")), False),
     other_size=(lambda model: data_prep.open_scene("place", 4), True),
     other_photo=(append(PHOTO), True),
@@ -1024,18 +1026,19 @@ def test_scenes_known_by_name_lie_in_data(in_tmp_dir, home):
 BLACK_LEFT = np.repeat([[0, 255]], 24, 1)[[0] * 64]  # twice as large as the photo (64,48)
 
 
-@pytest.mark.parametrize("folder", [IMAGES / "masks", MASKS], ids=["within", "beside"])
-@pytest.mark.parametrize("name, mask_name", [
-    ("toy_000.png", "toy_000.png"),
-    ("toy_000.jpg", "toy_000.png"),
-    ("toy_000.JPG", "TOY_000.PNG"),
-    ("toy_000.jpg", "toy_000.jpg.png"),
-    ("toy_000.jpg", "toy_000.jpg")])
-def test_black_pixels_of_masks_are_left_out(model, folder, name, mask_name):
+@cases(
+    "name, mask",
+    beside=("toy_000.png", "place/masks/toy_000.png"),
+    within=("toy_000.png", "place/images/masks/toy_000.png"),
+    in_capitals=("toy_000.JPG", "place/MASKS/TOY_000.PNG"),
+    of_the_stem=("toy_000.jpg", "place/masks/toy_000.png"),
+    of_the_name=("toy_000.jpg", "place/masks/toy_000.jpg.png"),
+    of_the_same_name=("toy_000.jpg", "place/images/masks/toy_000.jpg"))
+def test_black_pixels_of_masks_are_left_out(model, name, mask):
     change("names", 0, name)(model)
     PHOTO.rename(IMAGES / name)
     TABLE.unlink()
-    put(folder / mask_name, encoded(BLACK_LEFT, Path(mask_name).suffix))
+    put(mask, encoded(BLACK_LEFT, Path(mask).suffix))
     scene, out, err = made()
     share = scene["masked"].mean()
     assert "8 photos on disk" in out
@@ -1119,7 +1122,12 @@ def test_distances_to_parts_equal_closed_forms(shape, top, x, distance):
     assert_arrays_close(data_prep.part_sdf(part, np.array([center + x])), distance)
 
 
-@cases("i, knobs", town=(4, {}), alone=(3, dict(background=False)), other=(2, dict(landmark=4)), facade=(1, dict(landmark=-1)))
+@cases(
+    "i, knobs",
+    town=(4, {}),
+    alone=(3, dict(background=False)),
+    other=(2, dict(landmark=4)),
+    facade=(1, dict(landmark=-1)))
 def test_depth_is_where_the_distance_vanishes(i, knobs):
     scene = toy(**knobs)
     c2w = scene["c2w"][i]
