@@ -10,8 +10,8 @@ Scene files. A scene is one .npz of the arrays in FORMAT, below; some have those
 The landmark lies in the unit sphere. A ray is c2w[:, 3] + t * d with |d| = 1; a distance
 is this t, never a z-depth. x right, y down, z forward are a camera's axes, as in OpenCV.
 
-Masks. masks/ lies in the folder of photos or beside it; there the mask of photo.jpg is
-photo.png, photo.jpg.png or photo.jpg. Pixels darker than 128 are left out, and so are
+Masks. masks/ or MASKS/ lies in the folder of photos or beside it; there the mask of photo.jpg
+is photo.png, photo.jpg.png or photo.jpg. Pixels darker than 128 are left out, and so are
 pixels whose alpha channel is below 128, in a photo or a mask. A point that most photos
 see in such pixels is dropped.
 
@@ -19,7 +19,6 @@ Functions raise UserError, one sentence that says what to do.
 """
 import argparse
 import contextlib
-import difflib
 import gzip
 import hashlib
 import inspect
@@ -40,6 +39,7 @@ import unicodedata
 import zipfile
 import zlib
 from collections import defaultdict
+from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from types import SimpleNamespace
 from typing import NamedTuple
@@ -142,10 +142,9 @@ def is_memory_full(error):
 
 def progress(items, what):
     """Yields items and prints progress: after 10 s every second, in a log file every minute."""
-    is_terminal = sys.stdout.isatty()
-    wait = 1 if is_terminal else 60  # seconds
-    due = max(10, wait)
+    wait = 1 if sys.stdout.isatty() else 60  # seconds
     begin = time.monotonic()
+    due = max(10, wait)
     for done, item in enumerate(items, 1):
         yield item
         elapsed = time.monotonic() - begin
@@ -153,10 +152,8 @@ def progress(items, what):
         if elapsed > due or (is_last and elapsed > 10):
             due = elapsed + wait
             left = elapsed / done * (len(items) - done)
-            start = "\r" if is_terminal else ""  # over the line before
-            end = "" if is_terminal and not is_last else "\n"
-            line = f"  {what}: {done} of {len(items)}, {left:.0f} s left "
-            print(start + line, end=end, flush=True)
+            end = "\r" if wait == 1 and not is_last else "\n"  # the next line covers this one
+            print(f"  {what}: {done} of {len(items)}, {left:.0f} s left ", end=end, flush=True)
 
 
 def atomic_write(path, write):
@@ -175,7 +172,7 @@ def atomic_write(path, write):
 
 
 def write_scene(path, scene):
-    """Writes the file uncompressed: a third larger, but six times faster."""
+    """Writes a scene file, uncompressed: a third larger, but six times faster."""
     atomic_write(path, lambda temporary: np.savez(temporary, **scene))
 
 
@@ -280,14 +277,24 @@ def pixel_index(uv, wh):
 
 
 # ---- from photos, poses and points to a scene ------------------------------------------
-def find_sphere(x, weight, tracks, is_test, contain):
+@dataclass
+class Photo:
+    name: str
+    image: np.ndarray  # (h,w,3) uint8
+    masked: np.ndarray  # (h,w) bool, True is left out
+    K: np.ndarray  # (4,)
+    c2w: np.ndarray  # (3,4), in SfM units
+    track: np.ndarray  # (M,) indices of the points that it sees
+    is_test: bool  # held out
+
+
+def find_sphere(x, weight, photos, contain):
     """Centre (3,) and radius of the scene sphere, which becomes the unit sphere [D7].
 
     Centre: geometric median of points x (P,3) by weight. Radius: 1.1 x the distance of
     95 %; if that is a skyline, more than four times the median distance away, only
     nearer points are counted. At least half of the training photos have 30 % of their
-    points inside. All points contain (...,3) are inside. tracks: for each photo, the
-    indices (M,) of its points.
+    points inside. All points contain (...,3) are inside.
     """
     center = np.median(x, axis=0)
     for _ in range(20):  # Weiszfeld
@@ -300,72 +307,68 @@ def find_sphere(x, weight, tracks, is_test, contain):
         counted = counted[counted <= limit]
     # A distance in `counted`: between two of them there may be a gap.
     radius = 1.1 * np.quantile(counted, 0.95, method="inverted_cdf")
-    reach = [
-        np.quantile(distance[track], 0.3)
-        for track, held_out in zip(tracks, is_test)
-        if len(track) and not held_out
-    ]
-    check(reach,
-          "no training photo observes a usable 3D point: they do not belong together")
+    training = [photo for photo in photos if len(photo.track) and not photo.is_test]
+    check(training, "no training photo observes a usable 3D point: they do not belong together")
+    reach = [np.quantile(distance[photo.track], 0.3) for photo in training]
     corners = 1.02 * lengths(np.reshape(contain, (-1, 3)) - center)  # a margin
     radius = max(radius, np.median(reach), *corners)
     check(radius > EPSILON, "all 3D points coincide: run SfM again")
     return center, radius
 
 
-def unmasked(track, mask, K, c2w, x):
-    """The indices track (M,) of points x (P,3) but those seen in masked pixels. mask (h,w)"""
-    uv, _ = project(K, c2w, x[track])
-    return track[~mask.ravel()[pixel_index(uv, mask.shape[::-1])]]
+def count_sightings(photos, points):
+    """How many of the photos see each point. -> (P,)"""
+    return np.bincount(np.concatenate([photo.track for photo in photos]), minlength=len(points))
 
 
-def build_scene(
-        images, K, c2w, is_test, name, points, tracks, info, contain=(), masks=None):
-    """The scene of images (h,w,3), each of which sees the points tracks (M,).
+def drop_masked(photos, points):
+    """Drops sightings in masked pixels. -> whether a point keeps half of its sightings (P,)"""
+    before = count_sightings(photos, points)
+    for photo in photos:
+        uv, _ = project(photo.K, photo.c2w, points[photo.track, :3])
+        pixel = pixel_index(uv, photo.masked.shape[::-1])
+        photo.track = photo.track[~photo.masked.ravel()[pixel]]
+    return 2 * count_sightings(photos, points) >= before
 
-    SfM units: c2w; points (P,5): x y z, error [px], track length; contain (...,3).
-    masks: of each photo (h,w) bool, True is left out, and with it what is seen there: a
-    point is dropped if more than half of its sightings are.
-    """
+
+def build_scene(photos, points, info, contain=()):
+    """The scene of photos. points (P,5): x y z, error [px], track length; contain (...,3): points
+    that the sphere holds. Changes the photos."""
+    is_there = drop_masked(photos, points)
     error, track_length = points[:, 3:].T
-    wh = np.array([image.shape[1::-1] for image in images])
-    seen = np.bincount(np.concatenate(tracks), minlength=len(points))
-    if masks:
-        x = points[:, :3]
-        tracks = [unmasked(*row, x) for row in zip(tracks, masks, K, c2w)]
-    left = np.bincount(np.concatenate(tracks), minlength=len(points))
-    is_there = 2 * left >= seen
     usable = is_there & (track_length >= 3)
     if usable.sum() < 500:
         usable = is_there & (track_length >= 2)
-    check(usable.sum() >= 20,
-          f"{usable.sum()} usable 3D points: SfM needs more overlapping photos, or masks cover "
-          "too much")
+    count = usable.sum()
+    check(count >= 20, f"{count} usable 3D points: take more overlapping photos, or mask less")
     usable &= error <= np.quantile(error[usable], 0.95)
     new_index = np.cumsum(usable) - 1
-    tracks = [new_index[track[usable[track]]] for track in tracks]  # drop unusable, renumber
+    for photo in photos:
+        photo.track = new_index[photo.track[usable[photo.track]]]
     x = points[usable, :3]
     weight = np.minimum(track_length[usable], 20).astype(int)
-    center, radius = find_sphere(x, weight, tracks, is_test, contain)
-    c2w = np.array(c2w)
+    center, radius = find_sphere(x, weight, photos, contain)
+    c2w = np.array([photo.c2w for photo in photos])
     c2w[:, :, 3] = (c2w[:, :, 3] - center) / radius
+    wh = np.array([photo.image.shape[1::-1] for photo in photos])
+    masked = np.concatenate([photo.masked.ravel() for photo in photos])
     arrays = dict(
-        rgb=np.concatenate([image.reshape(-1, 3) for image in images]),
+        rgb=np.concatenate([photo.image.reshape(-1, 3) for photo in photos]),
         start=np.cumsum([0, *wh.prod(1)]),
         wh=wh,
-        K=K,
+        K=[photo.K for photo in photos],
         c2w=c2w,
-        is_test=is_test,
-        name=name,
+        is_test=[photo.is_test for photo in photos],
+        name=[photo.name for photo in photos],
         points=(x - center) / radius,
-        track_photo=np.repeat(np.arange(len(wh)), [len(track) for track in tracks]),
-        track_point=np.concatenate(tracks),
+        track_photo=np.repeat(np.arange(len(photos)), [len(photo.track) for photo in photos]),
+        track_point=np.concatenate([photo.track for photo in photos]),
         center=center,
         scale=radius,
         info=json.dumps(info))
     scene = {key: np.asarray(value, FORMAT[key][0]) for key, value in arrays.items()}
-    if masks:
-        scene["masked"] = np.concatenate([mask.ravel() for mask in masks])
+    if masked.any():
+        scene["masked"] = masked
     return add_statistics(scene)
 
 
@@ -434,10 +437,10 @@ def add_statistics(scene):
 # COLMAP's camera models: the numbers of their parameters, and what the perspective ones mean.
 PARAMETERS = [3, 4, 4, 5, 8, 8, 12, 5, 4, 5, 12, 16, 4, 5, 3, 4, 6, 2]
 PERSPECTIVE = {
-    0: "f cx cy",
+    0: "fx cx cy",
     1: "fx fy cx cy",
-    2: "f cx cy k1",
-    3: "f cx cy k1 k2",
+    2: "fx cx cy k1",
+    3: "fx cx cy k1 k2",
     4: "fx fy cx cy k1 k2 p1 p2",
     6: "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6",
 }
@@ -446,9 +449,7 @@ OPENCV_DISTORTION = "k1 k2 p1 p2 k3 k4 k5 k6".split()
 
 def records(path):
     """Yields, for each record of a COLMAP file, a function that reads values by a layout."""
-    check(path.is_file(),
-          f"{path} is missing: copy the whole model, or for points run "
-          "colmap point_triangulator")
+    check(path.is_file(), f"{path} is missing: copy the model, or run colmap point_triangulator")
     file = io.BytesIO(path.read_bytes())
 
     def read(layout):
@@ -464,20 +465,19 @@ def records(path):
 
 
 def read_cameras(sparse):
-    """{number: (wh, K (4,), OPENCV_DISTORTION (8,))} of a model's perspective cameras."""
+    """{number: ((w, h), K (4,), OPENCV_DISTORTION (8,))} of a model's perspective cameras."""
     cameras = {}
     for read in records(sparse / "cameras.bin"):
-        number, kind, *wh = read("IiQQ")
+        number, kind, w, h = read("IiQQ")
         check(0 <= kind < len(PARAMETERS),
-              f"{sparse} has camera model {kind}, which is unknown: run "
-              "colmap image_undistorter")
+              f"{sparse} has an unknown camera model, {kind}: run colmap image_undistorter")
         numbers = read(f"{PARAMETERS[kind]}d")
         if kind in PERSPECTIVE:
             value = dict(zip(PERSPECTIVE[kind].split(), numbers))
-            f = value.get("f")
-            K = [value.get("fx", f), value.get("fy", f), value["cx"], value["cy"]]
+            fy = value.get("fy", value["fx"])
+            K = [value["fx"], fy, value["cx"], value["cy"]]
             distortion = [value.get(name, 0.0) for name in OPENCV_DISTORTION]
-            cameras[number] = wh, np.array(K), np.array(distortion)
+            cameras[number] = (w, h), np.array(K), np.array(distortion)
     return cameras
 
 
@@ -495,25 +495,22 @@ def read_photos(sparse):
         ids = read(f"{3 * observations}Q")[2::3]
         is_outside = any(step in ("", "..") for step in name.split("/"))
         check(name not in photos and not is_outside,
-              f"{sparse}: photo {name!r} occurs twice or lies outside the image folder: "
-              "rename it")
+              f"{sparse}: rename photo {name!r}, which occurs twice or is outside the folder")
         photos[name] = cameras.get(camera), np.array(pose), ids
     return photos
 
 
 def check_photo(camera, pose, is_test):
     """UserError, a sentence about the photo, unless it can be used."""
-    check(camera,
-          "has no camera in the model, or a fisheye: run colmap image_undistorter")
+    check(camera, "has no camera in the model, or a fisheye: run colmap image_undistorter")
     wh, K, distortion = camera
     numbers = np.concatenate([K, distortion, pose])
     is_sound = (abs(numbers) < MAX_NUMBER).all() and min(K[:2]) > EPSILON and pose[:4].any()
     check(is_sound, "has no sound camera or pose: run SfM again")
-    check(max(wh) < 32767,
-          f"is {wh[0]} x {wh[1]} pixels, too large for OpenCV: shrink it, then run SfM again")
+    w, h = wh
+    check(max(wh) < 32767, f"is {w} x {h} pixels, too large: shrink it, then run SfM again")
     angle = 2 * np.degrees(np.arctan(max(wh / K[:2]) / 2))
-    check(is_test or 10 <= angle <= 120,
-          f"is {angle:.1f} degrees wide, which is not in 10..120")
+    check(is_test or 10 <= angle <= 120, f"is {angle:.1f} degrees wide, which is not in 10..120")
 
 
 def camera_to_world(pose):
@@ -535,15 +532,17 @@ def read_points(sparse):
     points = np.array(points, float).reshape(-1, 5)
     # A row with nan or a huge number becomes 0; build_scene drops points of track length 0.
     points[~(abs(points) < MAX_NUMBER).all(1)] = 0
-    check((points[:, 4] > 1).any(),
-          f"no point of {sparse} has a track: run colmap point_triangulator on it")
+    has_track = points[:, 4] > 1
+    check(has_track.any(), f"no point of {sparse} has a track: run colmap point_triangulator")
     return points, rows
 
 
 # ---- names and folders -----------------------------------------------------------------
-HEIC = rb"....ftyp(heic|heix|mif1|msf1)"  # how a file starts; phones often name it .jpg
+MODEL_FILES = ("cameras.bin", "images.bin", "points3D.bin")
+JPEG = rb"\xff\xd8\xff"  # how a file starts
+HEIC = rb"....ftyp(heic|heix|mif1|msf1)"  # phones often name it .jpg
 # A photo has one of these endings or starts. Some programs leave copies beside it.
-PHOTO_STARTS = rb"\xff\xd8\xff|\x89PNG|RIFF....WEBP|" + HEIC
+PHOTO_STARTS = rb"\x89PNG|RIFF....WEBP|" + JPEG + b"|" + HEIC
 PHOTO_ENDINGS = tuple(
     ".jpg .jpeg .png .tif .tiff .bmp .webp .ppm .pgm .jp2 .avif .heic .heif".split())
 COPY_ENDINGS = ("~", "_original", ".bak", ".thm")
@@ -583,31 +582,12 @@ def photo_files(folder, posed=()):
     files = {}
     for path in files_below(folder):
         name = path.relative_to(folder).as_posix()
-        ending = name.lower()
-        is_copy = name.startswith(("dense/", "masks/")) or ending.endswith(COPY_ENDINGS)
-        is_photo = not is_copy and (
-            ending.endswith(PHOTO_ENDINGS) or starts_with(path, PHOTO_STARTS))
-        if is_photo or name in posed:
+        lower = name.lower()
+        is_copy = lower.startswith(("dense/", "masks/")) or lower.endswith(COPY_ENDINGS)
+        is_photo = lower.endswith(PHOTO_ENDINGS) or starts_with(path, PHOTO_STARTS)
+        if name in posed or (is_photo and not is_copy):
             files[name] = path
     return files
-
-
-def mask_files(images, names):
-    """{photo: path of its mask}; masks/ lies beside the folder of photos or in it."""
-    folder = images / "masks"
-    if not folder.is_dir():
-        folder = images.parent / "masks"
-    files = {path.relative_to(folder).as_posix(): path for path in files_below(folder)}
-    masks = {}
-    for pattern in ("{0.parent}/{0.stem}.png", "{0}.png", "{0}"):
-        wanted = {name: os.path.normpath(pattern.format(PurePosixPath(name))) for name in names}
-        found = match_names(wanted.values(), files)
-        for name in names:
-            if wanted[name] in found:
-                masks.setdefault(name, files[found[wanted[name]]])
-    if files and not masks:
-        warn(f"{folder} is not used: no name in it, such as {min(files)}, is a photo's")
-    return masks
 
 
 def match_names(wanted, there):
@@ -615,181 +595,177 @@ def match_names(wanted, there):
 
     Names that differ in case or Unicode form only are alike.
     """
-    found = {name: name for name in wanted if name in there}
-    alike = defaultdict(lambda: ([], []))  # a form that they share: names of both sides
-    for side, names in enumerate([wanted, there]):
-        for name in set(names) - found.keys():
-            alike[unicodedata.normalize("NFC", name).casefold()][side].append(name)
-    for ours, theirs in alike.values():
-        if len(ours) == len(theirs) == 1:
-            found[ours[0]] = theirs[0]
-    return found
+    forms = []
+    for names in (wanted, there):
+        alike = defaultdict(set)
+        for name in names:
+            alike[unicodedata.normalize("NFC", name).casefold()].add(name)
+        forms.append({form: min(same) for form, same in alike.items() if len(same) == 1})
+    ours, theirs = forms
+    found = {ours[form]: theirs[form] for form in ours.keys() & theirs}
+    return found | {name: name for name in wanted if name in there}
 
 
 def name_hint(name, names):
-    """A hint at the name that may be meant, or nothing."""
+    """A hint at a name that differs in folder or ending only, or nothing."""
     stem = PurePosixPath(name).stem
     close = [other for other in names if PurePosixPath(other).stem == stem]
-    close += difflib.get_close_matches(name, names, 1)
     return f"; there is {close[0]!r}" if close else ""
 
 
+def mask_folders(images):
+    """Folders with "mask" in their name, in the folder of photos and beside it; masks/ first."""
+    folders = []
+    for place in (images, images.parent):
+        folders += [path for path in place.glob("*[mM][aA][sS][kK]*") if path.is_dir()]
+    return sorted(folders, key=lambda path: path.name.lower() != "masks")
+
+
+def mask_files(images, names):
+    """{photo: path of its mask}; tells which folders of masks are not used."""
+    masks = {}
+    for folder in mask_folders(images):
+        files = {path.relative_to(folder).as_posix(): path for path in files_below(folder)}
+        is_masks = folder.name.lower() == "masks" and not masks
+        # A mask counts under its whole name and without .png, photos also by their stem.
+        keys = files | {key[:-4]: path for key, path in files.items() if key[-4:].lower() == ".png"}
+        stems = {name: os.path.splitext(name)[0] for name in names if is_masks}
+        found = match_names([*stems, *stems.values()], keys)
+        for name, stem in stems.items():
+            if name in found or stem in found:
+                masks[name] = keys[found.get(stem, found.get(name))]
+        if files and not found:
+            warn(f"{folder} is not used: masks lie in masks/ and have photos' names, unlike "
+                 f"{min(files)}")
+    return masks
+
+
+# ---- models and splits of a folder -----------------------------------------------------
 def open_model(folder, sparse):
     """Reads a COLMAP model and finds the folder that holds most of its photos."""
     photos = read_photos(sparse)
-    places = []
-    for place in (sparse, *sparse.parents):
-        places += [place / "images", place / "input", place]
-        if place == folder:
-            break
-    on_disk = [photo_files(place, photos) for place in places]
-    matches = [match_names(photos, files) for files in on_disk]
-    best = max(range(len(places)), key=lambda i: len(matches[i]))
-    files = {name: on_disk[best][other] for name, other in matches[best].items()}
-    usable = [name for name in files if photos[name][0] is not None]  # with a camera
-    return SimpleNamespace(
-        sparse=sparse,
-        photos=photos,
-        images=places[best],
-        on_disk=list(on_disk[best]),
-        files=files,  # of the photos that are posed, and on disk
-        count=len(usable))
+    around = [sparse, *sparse.parents]
+    around = around[:around.index(folder) + 1]
+    models = []
+    for images in [place / name for place in around for name in ("images", "input", "")]:
+        on_disk = photo_files(images, photos)
+        matches = match_names(photos, on_disk)
+        models.append(SimpleNamespace(
+            sparse=sparse,
+            photos=photos,
+            images=images,
+            on_disk=list(on_disk),
+            files={name: on_disk[other] for name, other in matches.items()},  # of posed photos
+            count=sum(photos[name][0] is not None for name in matches)))  # those with a camera
+    return max(models, key=lambda model: len(model.files))
 
 
-def model_folders(folder):
-    return [path.parent for path in files_below(folder) if path.name == "images.bin"]
-
-
-def find_model(folder, command):
-    """The model in the folder with most photos; prints which photos and models it lacks.
-
-    command: how a model is made, for messages
-    """
+def find_model(folder):
+    """The model in the folder with most photos; prints which photos and models it lacks."""
+    models = []
     for path in files_below(folder):
         if os.path.isdir(path):
             warn(f"passed over: the folder {path} may not be read")
-    models = [open_model(folder, sparse) for sparse in model_folders(folder)]
+        if path.name == "images.bin":
+            models.append(open_model(folder, path.parent))
+    sfm = f"python data_prep.py {folder} --sfm"
+    parent = folder.absolute().parent
     if not models and folder.name in ("images", "input"):
-        parent = Path(os.path.abspath(folder)).parent
-        check(not model_folders(parent),
+        around = [path.name for path in files_below(parent)]
+        check("images.bin" not in around,
               f"{folder} has no COLMAP model, the folder around it has: give {parent}")
     check(models,
-          f"{folder} has no binary COLMAP model: run {command}, or for a text model "
+          f"{folder} has no binary COLMAP model: run {sfm}, or for a text model "
           "colmap model_converter --output_type BIN")
     best = max(models, key=lambda model: model.count)
-    check(best.photos,
-          f"{best.sparse} is an empty model, no photo is posed: delete it and run {command}")
+    check(best.photos, f"{best.sparse} is an empty model: delete it and run {sfm}")
     lost = sorted(best.photos.keys() - best.files)
     if lost:
         hint = name_hint(lost[0], best.on_disk)
         message = f"{len(lost)} photos of {best.sparse} are not on disk, such as {lost[0]!r}{hint}"
-        check(best.files, f"{message}: put them into {folder / 'images'}, or run {command}")
+        check(best.files, f"{message}: put them into {folder / 'images'}, or run {sfm}")
         warn(message)
-    on_disk = max(len(model.on_disk) for model in models)
-    print(f"{best.images}: {on_disk} photos on disk, {len(best.files)} posed by {best.sparse}")
+    count = len(best.on_disk)
+    print(f"{best.images}: {count} photos on disk, {len(best.files)} posed by {best.sparse}")
     for model in models:
         if model.photos.keys() != best.photos.keys():
             print(f"left out is another model: {len(model.photos)} posed by {model.sparse}")
     return best
 
 
-# ---- train/test split ------------------------------------------------------------------
 def read_table(path):
-    """Lines of a table of any separator, as lists of words."""
+    """Rows of a table of any separator as dictionaries; of a list train*.txt or test*.txt, too."""
     check(path.is_file(), f"the split file {path} is missing")
     text = path.read_text("utf-8-sig", "surrogateescape")
-    lines = [line for line in text.splitlines() if line.strip()] or [""]
-    separator = max("\t;,", key=lines[0].count)
-    return [[word.strip(' "') for word in line.split(separator)] for line in lines]
+    lines = [line for line in text.splitlines() if line.strip()]
+    if path.suffix == ".txt":
+        subset = "test" if "test" in path.name else "train"
+        return [dict(filename=line.strip(), split=subset) for line in lines]
+    separator = max("\t;,", key="".join(lines[:1]).count)
+    words = [[word.strip(' "') for word in line.split(separator)] for line in lines]
+    return [dict(zip(words[0], row)) for row in words[1:]]
 
 
 def split_files(folder, split):
     """The table of the split, or train_list.txt and test_list.txt: named or in the folder."""
-    if split:
-        found = [Path(split)]
-    else:
-        found = [
-            path for path in sorted(folder.glob("[!.]*.[ct]sv"))
-            if os.access(path, os.R_OK) and "split" in read_table(path)[0]
-        ] or list(folder.glob("train*.txt"))
+    found = [Path(split)] if split else [
+        path for path in sorted(folder.glob("[!.]*.[ct]sv"))
+        if os.access(path, os.R_OK) and any("split" in row for row in read_table(path))
+    ] or list(folder.glob("train*.txt"))
     check(len(found) < 2, f"choose a split file by --split: {', '.join(map(str, found))}")
     if found and found[0].suffix == ".txt":
         names = [re.sub("train|test", subset, found[0].name) for subset in ("train", "test")]
-        found = [found[0].with_name(name) for name in names]
+        return [found[0].with_name(name) for name in names]
     return found
 
 
-def read_split(tables, names):
+def read_split(paths, names):
     """{name: whether it is held out} of what split_files finds, with names as they are here.
 
     A table has NeRF-W's columns; rows with an empty id do not count.
     """
-    path = tables[0]
-    print(f"split by {path}")
-    if len(tables) == 2:
-        head = ["filename", "split"]
-        lines = [
-            (words[0], subset)
-            for subset, table in zip(("train", "test"), tables)
-            for words in read_table(table)
-        ]
-    else:
-        head, *lines = read_table(path)
-        check({"filename", "split"} <= set(head),
-              f"{path} needs a header with filename and split")
-    is_held_out = {}
-    for row in [dict(zip(head, line)) for line in lines]:
+    print(f"split by {paths[0]}")
+    subsets = {}
+    for row in itertools.chain(*map(read_table, paths)):
         name, subset = row.get("filename"), row.get("split")
-        is_test = subset == "test"
         if row.get("id") != "":
-            is_clear = is_held_out.setdefault(name, is_test) == is_test
-            check(name and subset in ("train", "test") and is_clear,
-                  f"{path}: {name!r} is {subset!r}; each is train or test, and not both")
-    matches = match_names(is_held_out, names)
-    is_held_out = {matches.get(name, name): is_test for name, is_test in is_held_out.items()}
-    rest = set(names) - is_held_out.keys()
+            is_clear = subset in ("train", "test") and subsets.setdefault(name, subset) == subset
+            check(name and is_clear,
+                  f"{paths[0]}: filename {name!r} has split {subset!r}; each has train or test")
+    matches = match_names(subsets, names)
+    rest = set(names) - set(matches.values())
     if rest:
-        warn(f"{len(rest)} photos are not in {path}: {min(rest)} ...")
-    return is_held_out
+        warn(f"{len(rest)} photos are not in {paths[0]}: {min(rest)} ...")
+    return {matches.get(name, name): subset == "test" for name, subset in subsets.items()}
 
 
-# ---- checksums -------------------------------------------------------------------------
-def checksum(files, masks, sources=()):
-    """CRC-32 over the photos' names and content, their masks, and other sources' content.
-
-    files, masks: {name: path}. A file that is missing or may not be read adds nothing.
-    """
-    named = [("", path) for path in sources]
-    for name in sorted(files):
-        named += [(name, files[name]), ("", masks.get(name))]
+def checksum(paths):
+    """CRC-32 over files' names and content. A file that cannot be read adds only its name."""
     crc = 0
-    for name, path in named:
-        crc = zlib.crc32(os.fsencode(name), crc)
-        if path:
-            with contextlib.suppress(FileNotFoundError, PermissionError):
-                crc = zlib.crc32(path.read_bytes(), crc)
+    for path in paths:
+        crc = zlib.crc32(os.fsencode(path), crc)
+        with contextlib.suppress(OSError):
+            crc = zlib.crc32(path.read_bytes(), crc)
     return crc
 
 
 def fingerprint(info):
-    """CRC-32 over the content of all files that a scene is read from, wherever they lie."""
-    folder = Path(info["folder"])
-    images = Path(info["images"])
-    sources = [
-        sparse / name
-        for sparse in model_folders(folder)
-        for name in ("cameras.bin", "images.bin", "points3D.bin")
-    ]
-    sources += split_files(folder, info["split"])
-    there = photo_files(images, set(info["posed"]))
-    matches = match_names(info["posed"], there)
-    files = {name: there[other] for name, other in matches.items()}
-    return checksum(files, mask_files(images, files), sources)
+    """Checksum of the files a scene is read from: models, split tables, posed photos, masks."""
+    folder, images = Path(info["folder"]), Path(info["images"])
+    paths = [path for path in files_below(folder) if path.name in MODEL_FILES]
+    paths += split_files(folder, info["split"])
+    photos = photo_files(images, info["posed"])
+    paths += [photos[name] for name in sorted(match_names(info["posed"], photos).values())]
+    for masks in mask_folders(images):
+        paths += files_below(masks)
+    return checksum(paths)
 
 
 # ---- photos and masks ------------------------------------------------------------------
 # Starts a segment of a JPEG or ends it; FF 00 is a byte of pixels, the others have no length.
 MARKER = re.compile(rb"\xff[\x02-\xcf\xd9-\xfe]")
+# In a TIFF with two samples per pixel, in either byte order: the second is alpha.
+GREY_WITH_ALPHA = re.compile(rb"\x15\x01\x03\0\x01\0\0\0\x02\0|\x01\x15\0\x03\0\0\0\x01\0\x02")
 
 
 def is_cut_off(data):
@@ -809,180 +785,134 @@ def is_cut_off(data):
     return True
 
 
-def decode(data, flags):
-    """The decoded image, or None."""
+def read_image(path, flags):
+    """An image file's pixels; UserError, a sentence about the file, where it has none."""
     try:
-        return cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+        data = path.read_bytes()
+        check(not is_cut_off(data), "is cut off: copy it again")
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    except OSError as e:
+        raise UserError(f"cannot be read: {e.strerror}") from e
     except cv2.error as e:  # empty, or more than a gigapixel
         if is_memory_full(e):
             raise MemoryError("the memory is full: use smaller photos") from e
-        return None
-
-
-def undistort(image, camera):
-    """An image (h,w) or (h,w,3) as a pinhole camera sees it, and its K (4,)."""
-    wh, K, distortion = camera
-    if not distortion.any():
-        return image, K
-    fx, fy, cx, cy = K - (0, 0, 0.5, 0.5)  # OpenCV's first pixel is at 0
-    M = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-    # alpha = 0: every pixel lies in the photo
-    P, _ = cv2.getOptimalNewCameraMatrix(M, distortion, wh, 0)
-    image = cv2.undistort(image, M, distortion, None, P)
-    return image, np.array([P[0, 0], P[1, 1], P[0, 2] + 0.5, P[1, 2] + 0.5])
+        image = None
+    check(image is not None, "is empty, damaged, too large or of an unknown type: replace it")
+    return image
 
 
 def read_photo(path, size):
     """The photo (h,w,3) in uint8, BGR, as a camera of this size (w, h) saw it."""
-    w, h = size
     check(path.exists(), "is a broken link: copy the photo itself")
     check(not starts_with(path, HEIC), "is HEIC, which cannot be read: convert it to JPEG")
-    data = content(path)
-    check(not is_cut_off(data), "is cut off: copy it again")
-    image = decode(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-    check(image is not None,
-          "is empty, damaged, too large or no photo of a known type: replace it")
-    stored = image.shape[1::-1]
-    if stored != (w, h):
-        image = decode(data, cv2.IMREAD_COLOR)
-    size = image.shape[1::-1]
-    tag = "" if size == stored else f", {size[0]} x {size[1]} by its EXIF orientation tag"
-    check(size == (w, h),
-          f"has {stored[0]} x {stored[1]} pixels{tag}, its camera {w} x {h}: put back what "
-          "SfM saw")
+    image = read_image(path, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    h, w = image.shape[:2]
+    if (w, h) != size:
+        image = read_image(path, cv2.IMREAD_COLOR)  # turned by its EXIF tag
+    check(image.shape[1::-1] == size,
+          f"has {w} x {h} pixels, its camera {size[0]} x {size[1]}: put back what SfM saw")
     return image
 
 
-def shrink_photo(image, camera, downscale):
-    """Undistorts and downscales a photo. -> rgb uint8 (h,w,3), K (4,)"""
-    w, h = camera[0]
-    check(1 <= downscale <= min(w, h) / 2, f"is {w} x {h}: choose another --downscale")
-    image, K = undistort(image, camera)
-    small = w // downscale, h // downscale
+def shrink(image, camera, downscale):
+    """Undistorts and downscales a photo (h,w,3) or a mask (h,w). -> it, K (4,)"""
+    size, K, distortion = camera
+    check(1 <= downscale <= min(size) / 2, f"is {size[0]} x {size[1]}: change --downscale")
+    if distortion.any():
+        fx, fy, cx, cy = K - (0, 0, 0.5, 0.5)  # OpenCV's first pixel is at 0
+        M = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+        # alpha = 0: every pixel lies in the photo
+        P, _ = cv2.getOptimalNewCameraMatrix(M, distortion, size, 0)
+        image = cv2.undistort(image, M, distortion, None, P)
+        K = np.array([P[0, 0], P[1, 1], P[0, 2] + 0.5, P[1, 2] + 0.5])
+    small = size[0] // downscale, size[1] // downscale
     image = cv2.resize(image, small, interpolation=cv2.INTER_AREA)
-    shrink = np.divide(small, (w, h))
-    return image[..., ::-1], K * np.tile(shrink, 2)  # fx, cx by width; fy, cy by height
+    return image, K * np.tile(np.divide(small, size), 2)  # fx, cx by width; fy, cy by height
 
 
-def content(path):
-    """A file's bytes; UserError, a sentence about the file, where it cannot be read."""
-    try:
-        return path.read_bytes()
-    except OSError as e:
-        raise UserError(f"cannot be read: {e.strerror}") from e
-
-
-def read_alpha(path):
-    """The alpha channel (h,w) of a file, or None if all of it is opaque."""
-    data = content(path)
-    is_jpeg = data[:2] == b"\xff\xd8"
-    image = None if is_jpeg else decode(data, cv2.IMREAD_UNCHANGED)
-    if image is None or image.shape[2:] != (4,) or image.dtype.kind != "u":
-        return None
-    alpha = image[..., 3] / (np.iinfo(image.dtype).max / 255)
-    check((alpha >= 128).any(), "is transparent all over")
-    return alpha if (alpha < 128).any() else None
-
-
-def read_grey(path):
-    """A mask file's brightness (h,w), at most its alpha."""
-    grey = decode(content(path), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
-    check(grey is not None, "is no image")
-    check((grey >= 128).any(), "is black all over; 255 is white")
-    alpha = read_alpha(path)
-    return grey if alpha is None else np.minimum(grey, alpha)
+def read_opaque(path, is_mask):
+    """Which pixels (h,w) of a file are opaque, and bright in a mask; None for all of them."""
+    layers = []
+    if is_mask:
+        layers.append(read_image(path, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION))
+    if not starts_with(path, JPEG):  # which has no alpha channel
+        image = read_image(path, cv2.IMREAD_UNCHANGED)
+        check(not GREY_WITH_ALPHA.search(path.read_bytes()),
+              "is a grey TIFF with alpha, which cannot be read: save it as PNG")
+        if image.shape[2:] == (4,) and image.dtype.kind == "u":
+            layers.append(image[..., 3] / (np.iinfo(image.dtype).max / 255))
+    return np.min(layers, axis=0) >= 128 if layers else None
 
 
 def read_mask(photo, path, size):
-    """The mask of a photo by its mask file, if any, and its alpha channel, in size (w, h).
+    """The mask of a photo by its alpha channel and its mask file, if any, in size (w, h).
 
-    -> uint8 (h,w): 0 is left out, 255 is not; None without both. A bad mask is told.
+    -> uint8 (h,w): 0 is left out, 255 is not. A bad mask is told.
     """
-    layers = []
-    for read, file in [(read_grey, path), (read_alpha, photo)]:
+    w, h = size
+    mask = np.full((h, w), 255, np.uint8)
+    for file in [photo, path] if path else [photo]:
         try:
-            layer = read(file) if file else None
+            layer = read_opaque(file, file is path)
             if layer is not None:
-                h, w = layer.shape
-                check(abs(w * size[1] / (h * size[0]) - 1) < 0.02,
-                      f"has {w} x {h} pixels, its photo {size[0]} x {size[1]}")
-                layer = np.where(layer < 128, 0, 255).astype(np.uint8)
-                layers.append(cv2.resize(layer, size, interpolation=cv2.INTER_NEAREST))
+                check(layer.any(), "is black or transparent all over; 255 is white")
+                height, width = layer.shape
+                check(abs(width * h / (height * w) - 1) < 0.02,
+                      f"has {width} x {height} pixels, its photo {w} x {h}")
+                layer = cv2.resize(layer.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
+                mask *= layer
         except UserError as e:
             warn(f"mask not used: {file} {e}")
-    return np.min(layers, axis=0) if layers else None
-
-
-def read_masks(model, usable):
-    """The pixels that are left out of each usable photo: a list of (h,w) bool, or None."""
-    paths = mask_files(model.images, usable)
-    masks = [np.zeros(image.shape[:2], bool) for image, *_ in usable.values()]
-    used = 0
-    for i, name in enumerate(usable):
-        camera = model.photos[name][0]
-        mask = read_mask(model.files[name], paths.get(name), camera[0])
-        if mask is not None:
-            mask, _ = undistort(mask, camera)
-            size = masks[i].shape[::-1]
-            masks[i] = cv2.resize(mask, size, interpolation=cv2.INTER_AREA) < 128
-            used += 1
-    if not used:
-        return None
-    black = np.mean(np.concatenate([masked.ravel() for masked in masks]))
-    print(f"{used} of {len(masks)} photos have a mask: {black:.0%} of all pixels are black "
-          "and left out")
-    return masks
+    return mask
 
 
 # ---- prepare ---------------------------------------------------------------------------
 def read_usable(model, points, rows, is_held_out, downscale):
-    """{name: (rgb, K, c2w, rows of its points)} of the photos that can be used.
+    """The photos that can be used, sorted by name. Prints which cannot, and why.
 
-    Prints which cannot, and why. Of photos with the same pixels one is used for training,
-    or none if one of them is held out.
+    Of photos with the same pixels one is used for training, or none if one is held out.
     """
-    usable = {}
-    misfits = {}  # photos that miss most of the points that they should see
-    pixels = {}  # hashes
-    for name in progress(sorted(is_held_out), "preparing photos"):
+    masks = mask_files(model.images, model.files)
+    photos = []
+    first = {}  # by hash of pixels: name of the first photo that has them
+    lost = []  # held-out photos that cannot be used
+    misfits = 0  # photos that miss most of the points that they should see
+    names = sorted(is_held_out, key=lambda name: (not is_held_out[name], name))
+    for name in progress(names, "preparing photos"):
+        is_test = is_held_out[name]
         try:
             check(name in model.photos, f"has no pose{name_hint(name, model.files)}")
             check(name in model.files, f"is not on disk{name_hint(name, model.on_disk)}")
             camera, pose, ids = model.photos[name]
-            check_photo(camera, pose, is_held_out[name])
+            check_photo(camera, pose, is_test)
             image = read_photo(model.files[name], camera[0])
-            pixels[name] = hashlib.sha256(image).digest()
-            image, K = shrink_photo(image, camera, downscale)
+            pixels = hashlib.sha256(image).digest()
+            twin = first.get(pixels)
+            check(is_test or not twin, f"is the same photo as {twin}")
+            image, K = shrink(image, camera, downscale)
+            c2w = camera_to_world(pose)
+            track = np.array([rows[key] for key in ids if key in rows], int)
+            uv, _ = project(K, c2w, points[track, :3])
+            is_inside = is_in_photo(uv, image.shape[1::-1])
+            share = is_inside.mean() if len(track) else 1
+            misfits += share < 0.5
+            check(share >= 0.5, f"shows {share:.0%} of its points: wrong pose or distortion")
         except UserError as e:
             warn(f"left out: {name} {e}")
+            if is_test:
+                lost.append(name)
             continue
-        c2w = camera_to_world(pose)
-        track = np.array([rows[key] for key in ids if key in rows], int)
-        uv, _ = project(K, c2w, points[track, :3])
-        is_inside = is_in_photo(uv, image.shape[1::-1])
-        if len(track) and is_inside.mean() < 0.5:
-            misfits[name] = is_inside.mean()
-        usable[name] = image, K, c2w, track
-    check(2 * len(misfits) <= len(usable),
-          f"{len(misfits)} of {len(usable)} photos miss most of their points: give poses as "
+        first.setdefault(pixels, name)
+        mask = read_mask(model.files[name], masks.get(name), camera[0])
+        mask, _ = shrink(mask, camera, downscale)
+        photos.append(Photo(name, image[..., ::-1], mask < 128, K, c2w, track, is_test))
+    check(misfits <= len(photos),
+          f"{misfits} of {misfits + len(photos)} photos miss most of their points: give poses as "
           "COLMAP does, world to camera, x right, y down, z forward, in the units of the points")
-    for name, share in misfits.items():
-        warn(f"left out: {name} shows {share:.0%} of its points: its pose or its distortion "
-             "is wrong")
-        del usable[name]
-    first = {}  # the photo that is used, by its pixels
-    for name in sorted(usable, key=lambda name: not is_held_out[name]):
-        twin = first.setdefault(pixels[name], name)
-        if twin != name and not is_held_out[name]:
-            warn(f"left out: {name} is the same photo as {twin}")
-            del usable[name]
-    lost = [name for name in is_held_out if is_held_out[name] and name not in usable]
-    check(not lost,
-          f"held-out photos cannot be used, repair them or hold out others: {lost}")
-    count = sum(not is_held_out[name] for name in usable)
-    check(count >= 2,
-          f"{count} usable training photos are too few: repair them or the split file")
-    return usable
+    check(not lost, f"held-out photos cannot be used, repair them or hold out others: {lost}")
+    count = sum(not photo.is_test for photo in photos)
+    check(count >= 2, f"{count} usable training photos are too few: repair them or the split file")
+    return sorted(photos, key=lambda photo: photo.name)
 
 
 def check_sphere(scene):
@@ -1003,9 +933,8 @@ def check_sphere(scene):
              "in a room: expect poor geometry; this method is for a landmark seen from outside")
 
 
-def read_folder(folder, command, downscale, split):
-    """The scene of a folder; command: how a model is made, for messages."""
-    model = find_model(folder, command)
+def read_folder(folder, downscale, split):
+    model = find_model(folder)
     info = dict(
         scene=folder.resolve().name,
         kind="colmap",
@@ -1020,15 +949,16 @@ def read_folder(folder, command, downscale, split):
     if tables:
         is_held_out = read_split(tables, model.files)
     points, rows = read_points(model.sparse)
-    usable = read_usable(model, points, rows, is_held_out, downscale)
+    photos = read_usable(model, points, rows, is_held_out, downscale)
     if not tables:
         print(f"{folder} has no split file: every eighth photo is held out")
-        is_held_out = {name: i % 8 == 7 for i, name in enumerate(usable)}
-    masks = read_masks(model, usable)
-    images, K, c2w, tracks = zip(*usable.values())
-    is_test = [is_held_out[name] for name in usable]
-    scene = build_scene(
-        images, K, c2w, is_test, list(usable), points, tracks, info, masks=masks)
+        for photo in photos[7::8]:
+            photo.is_test = True
+    scene = build_scene(photos, points, info)
+    if "masked" in scene:
+        count = sum(photo.masked.any() for photo in photos)
+        print(f"masks leave out {scene['masked'].mean():.0%} of all pixels, in {count} of "
+              f"{len(photos)} photos")
     check_sphere(scene)
     return scene
 
@@ -1036,14 +966,13 @@ def read_folder(folder, command, downscale, split):
 def prepare(name, downscale=2, split=None):
     """Scene of one of SCENES, or of a folder with photos and a COLMAP model; see FORMAT."""
     folder = Path(name)
-    command = f"python data_prep.py {name} --sfm"
     if name in SCENES:
         folder = DATA / name
-        command = f"python data_prep.py {name} --download"
         if not folder.is_dir():
             folder = DATA / SCENES[name][0]
+        check(folder.is_dir(), f"{folder} is missing: run python data_prep.py {name} --download")
     try:
-        return read_folder(folder, command, downscale, split and os.path.abspath(split))
+        return read_folder(folder, downscale, split and os.path.abspath(split))
     except (MemoryError, cv2.error) as e:
         if not is_memory_full(e):
             raise
@@ -1076,10 +1005,8 @@ def open_scene(name_or_folder, downscale=2):
         if info["downscale"] == downscale and (is_gone or info["files"] == fingerprint(info)):
             return scene
     print(f"making {path}")
-    if name_or_folder == "toy":
-        scene = make_toy()
-    else:
-        scene = prepare(name_or_folder, downscale, split)
+    is_toy = name_or_folder == "toy"
+    scene = make_toy() if is_toy else prepare(name_or_folder, downscale, split)
     write_scene(path, scene)
     return scene
 
@@ -1405,15 +1332,14 @@ def draw_people(rng, w, h, share):
     return small.reshape(-1, 4).astype(float)
 
 
-def toy_points(rng, cameras, surface, seen):
-    """Points as by SfM, noisy and 1.5 % of them wrong, from lists with an item a photo.
+def toy_points(rng, photos, surface, seen):
+    """Points (P,5) as by SfM, noisy and 1.5 % of them wrong, as in build_scene; sets tracks.
 
-    cameras: K, c2w, width, height; surface: points (h*w,3) that the pixels see; seen:
-    their distances (h*w,), inf where a person is in front
-    -> points (P,5) and tracks, as in build_scene
+    For each photo, surface: points (h*w,3) that the pixels see; seen: their distances
+    (h*w,), inf where a person is in front
     """
     samples = []
-    count = 3000 // len(cameras)
+    count = 3000 // len(photos)
     for x, t in zip(surface, seen):
         is_landmark = (abs(x - (0, 0, 1.02)) < (1.3, 1.3, 1)).all(1)
         for some, n in [(is_landmark, count), (~is_landmark, count // 5)]:
@@ -1421,18 +1347,17 @@ def toy_points(rng, cameras, surface, seen):
             if len(pixels):
                 samples.append(x[rng.choice(pixels, n)])
     x = np.concatenate(samples)
-    tracks = []
-    for (K, c2w, *wh), t in zip(cameras, seen):
-        uv, distance = project(K, c2w, x)
+    for photo, t in zip(photos, seen):
+        wh = photo.image.shape[1::-1]
+        uv, distance = project(photo.K, photo.c2w, x)
         is_visible = abs(t[pixel_index(uv, wh)] / distance - 1) < 0.02
         is_found = rng.random(len(x)) < 0.6
-        tracks.append(np.flatnonzero(is_in_photo(uv, wh) & is_visible & is_found))
+        photo.track = np.flatnonzero(is_in_photo(uv, wh) & is_visible & is_found)
     is_wrong = rng.random((len(x), 1)) < 0.015
     x += is_wrong * rng.uniform(-1, 1, x.shape)
     x += rng.normal(0, 0.005, x.shape)
-    error = np.zeros(len(x))
-    track_length = np.bincount(np.concatenate(tracks), minlength=len(x))
-    return np.column_stack([x * TOY_SCALE + TOY_ORIGIN, error, track_length]), tracks
+    track_length = count_sightings(photos, x)
+    return np.column_stack([x * TOY_SCALE + TOY_ORIGIN, np.zeros(len(x)), track_length])
 
 
 def add_pose_noise(rng, K, c2w, pixels):
@@ -1480,10 +1405,10 @@ def make_toy(seed=0, size=96, photos=48, test=8, occluders=0.05, exposure=1.0,
     turn = np.radians(sun_rng.uniform(-sun, sun, count))  # of the sun
     weather = sky_rng.uniform(-sky, sky, (count, 4))
     parts = toy_parts(landmark, background)
-    drawn = []
+    taken, depth, surface, occluder = [], [], [], []
     for i in progress(numbers, "drawing photos"):
         camera = toy_camera(camera_rng, np.radians(azimuth[i]), size)
-        _, c2w, w, h = camera
+        K, c2w, w, h = camera
         o = c2w[None, :, 3]
         to_sun = cv2.Rodrigues((0, 0, turn[i]))[0] @ SUN
         samples = []
@@ -1496,21 +1421,21 @@ def make_toy(seed=0, size=96, photos=48, test=8, occluders=0.05, exposure=1.0,
         gain = 2 ** (brightness / 2) * np.array([1 + 0.1 * red, 1, 1 + 0.1 * blue])
         srgb = np.clip(linear * gain, 0, 1) ** (1.2 ** contrast / 2.2)
         image = (srgb * 255 + 0.5).astype(np.uint8).reshape(h, w, 3)
+        masked = np.zeros((h, w), bool)
+        taken.append(Photo(f"toy_{i:03d}.png", image, masked, K, c2w, None, is_test[i]))
         d = ray_directions(*camera)
         t, _ = trace(o, d, parts)
-        drawn.append((camera, image, t, o + t[:, None] * d, people[:, 3] > 0))
-    cameras, images, depth, surface, occluder = zip(*drawn)
+        depth.append(t)
+        surface.append(o + t[:, None] * d)
+        occluder.append(people[:, 3] > 0)
     seen = [np.where(people, np.inf, t) for people, t in zip(occluder, depth)]
-    points, tracks = toy_points(sfm_rng, cameras, surface, seen)
-    K, c2w, _, _ = zip(*cameras)
-    for i in numbers:
-        add_pose_noise(pose_rng, K[i], c2w[i], pose_noise * (not is_test[i]))
-        c2w[i][:, 3] = c2w[i][:, 3] * TOY_SCALE + TOY_ORIGIN
+    points = toy_points(sfm_rng, taken, surface, seen)
+    for photo in taken:
+        add_pose_noise(pose_rng, photo.K, photo.c2w, pose_noise * (not photo.is_test))
+        photo.c2w[:, 3] = photo.c2w[:, 3] * TOY_SCALE + TOY_ORIGIN
     signs = np.array(list(itertools.product((-1, 1), repeat=3)))
     corners = [part.center + part.half * signs for part in toy_parts(landmark, background=False)]
-    scene = build_scene(
-        images, K, c2w, is_test, [f"toy_{i:03d}.png" for i in numbers], points, tracks,
-        info, contain=np.array(corners) * TOY_SCALE + TOY_ORIGIN)
+    scene = build_scene(taken, points, info, np.array(corners) * TOY_SCALE + TOY_ORIGIN)
     scene["depth"] = np.float16(np.concatenate(depth) * TOY_SCALE / scene["scale"])
     scene["occluder"] = np.concatenate(occluder)
     some = np.concatenate(surface)[::9]  # every ninth pixel; sky is infinite and drops out
@@ -1550,10 +1475,6 @@ def depth_edges(depth):
     return edges
 
 
-def mean_or_none(values):
-    return float(values.mean()) if len(values) else None
-
-
 def toy_truth(scene, sdf, gradient, mask=None):
     """What only a toy can tell of a trained model. sdf (.,): its signed distance at near_wall;
     gradient (.,3): the slope of that at wall; mask (P,): its M at all pixels of training photos.
@@ -1567,8 +1488,7 @@ def toy_truth(scene, sdf, gradient, mask=None):
     truth = dict(
         sdf_error=float(np.abs(sdf - scene["near_wall_sdf"]).mean()),
         normal_error=float(np.median(np.degrees(np.arccos(np.clip(cos, -1, 1))))))
-    regions = ("iou", "static", "edges", "flat", "sky")
-    truth |= {f"mask_{region}": None for region in regions}
+    truth |= dict.fromkeys(["mask_iou", "mask_static", "mask_edges", "mask_flat", "mask_sky"])
     if mask is None:
         return truth
     is_train = np.repeat(~scene["is_test"], np.diff(scene["start"]))  # by pixel
@@ -1577,10 +1497,10 @@ def toy_truth(scene, sdf, gradient, mask=None):
     edges = [depth_edges(depth.reshape(h, w)).ravel() for depth, (w, h) in depths]
     edges = np.concatenate(edges)[is_train]
     is_sky = np.isinf(scene["depth"][is_train])
-    truth["mask_static"] = mean_or_none(mask[~people])
-    truth["mask_edges"] = mean_or_none(mask[~people & edges])
-    truth["mask_flat"] = mean_or_none(mask[~people & ~edges])
-    truth["mask_sky"] = mean_or_none(mask[~people & is_sky])
+    for region, pixels in dict(static=True, edges=edges, flat=~edges, sky=is_sky).items():
+        static = mask[~people & pixels]
+        if len(static):
+            truth[f"mask_{region}"] = float(static.mean())
     if people.any():
         found = mask > 0.5
         truth["mask_iou"] = float((found & people).sum() / (found | people).sum())
@@ -1597,8 +1517,8 @@ def fetch(folder_url, path):
         return
     url = folder_url + path.name
     partial = path.with_name(path.name + ".part")
+    path.parent.mkdir(exist_ok=True)
     try:
-        path.parent.mkdir(exist_ok=True)
         with open(partial, "ab") as file:
             # Ask for the last byte again: past the end of a complete file a server answers 416.
             have = max(file.tell() - 1, 0)
@@ -1619,32 +1539,26 @@ def fetch(folder_url, path):
         raise UserError(message) from e
 
 
-def unpack(archive, wanted, folder):
-    """Unpacks the files whose names start with `wanted`; checks the whole .tar.gz."""
-    with gzip.open(archive) as raw, tarfile.open(fileobj=raw, mode="r|") as tar:
-        for member in tar:  # files only: a link could lead outside
-            if member.isfile() and member.name.startswith(wanted):
-                tar.extract(member, folder, filter="data")
-        while raw.read(1 << 20):  # to the checksum at the very end
-            pass
-
-
 def download(name):
     """Downloads photos, reconstruction and split file of one of SCENES -> data/<name>/"""
     check(name in SCENES, f"--download knows {', '.join(SCENES)}, not {name}")
     inner, split = SCENES[name]
     folder = DATA / name
-    split = DATA / split
     archive = DATA / f"{inner}.tar.gz"
     check(not folder.exists(), f"{folder} is there already: move it, or leave --download out")
-    fetch(SPLIT_URL, split)
+    fetch(SPLIT_URL, DATA / split)
     fetch(ARCHIVE_URL, archive)
+    wanted = (f"{inner}/dense/images/", f"{inner}/dense/sparse/")
     try:
         with tempfile.TemporaryDirectory(dir=DATA) as temporary:
-            unpack(archive, (f"{inner}/dense/images/", f"{inner}/dense/sparse/"), temporary)
-            unpacked = Path(temporary) / inner
-            shutil.copy(split, unpacked / split.name)
-            unpacked.replace(folder)
+            with gzip.open(archive) as raw, tarfile.open(fileobj=raw, mode="r|") as tar:
+                for member in tar:  # files only: a link could lead outside
+                    if member.isfile() and member.name.startswith(wanted):
+                        tar.extract(member, temporary, filter="data")
+                while raw.read(1 << 20):  # to the checksum at the very end
+                    pass
+            shutil.copy(DATA / split, Path(temporary, inner, split))
+            Path(temporary, inner).replace(folder)
     except Exception as e:  # a damaged archive can fail in any layer
         message = f"cannot unpack {archive} ({e}): free space, or delete it and retry"
         raise UserError(message) from e
@@ -1654,43 +1568,27 @@ def sfm_photos(images):
     """{name: path} of raw photos, all of which pycolmap can read."""
     files = photo_files(images)
     for name, path in list(files.items()):
+        is_text = name == name.encode(errors="replace").decode()
+        check(is_text, f"the name {name!a} is not UTF-8: rename the photo")
+        check(not starts_with(path, HEIC), f"{name} is HEIC: convert all such photos to JPEG")
         if not starts_with(path, b"."):
             warn(f"left out: {name} is empty, a broken link or may not be read")
             del files[name]
     check(files, f"{images} has no photos of a known type: name the folder that holds them")
-    heic = [name for name, path in files.items() if starts_with(path, HEIC)]
-    check(not heic,
-          f"{len(heic)} photos are HEIC, such as {heic[:1]}, which cannot be read: convert "
-          "them to JPEG")
-    for name in files:
-        is_text = os.fsencode(name).decode(errors="replace") == name
-        check(is_text, f"the name {name!a} is not UTF-8: rename the photo")
     return files
 
 
 def write_sfm_masks(files, masks, folder):
     """Writes masks in the photos' sizes under COLMAP's names, photo.jpg.png."""
     for name, path in progress(files.items(), "looking for masks"):
-        photo = decode(path.read_bytes(), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-        if photo is None:
-            warn(f"{name} cannot be read, it is damaged or too large: replace it")
+        try:
+            photo = read_image(path, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+        except UserError as e:
+            warn(f"{name} {e}")
             continue
         mask = read_mask(path, masks.get(name), photo.shape[1::-1])
-        if mask is not None:
-            target = folder / f"{name}.png"
-            target.parent.mkdir(parents=True, exist_ok=True)
-            target.write_bytes(cv2.imencode(".png", mask)[1].tobytes())
-
-
-def import_pycolmap():
-    install = 'run pip install "pycolmap>=3.13"'
-    try:
-        import pycolmap  # an extra
-    except ImportError as e:
-        raise UserError(f"--sfm needs pycolmap ({e}): {install}") from e
-    check(hasattr(pycolmap, "FeatureExtractionOptions"),
-          f"pycolmap {pycolmap.__version__} is too old: {install}")
-    return pycolmap
+        if not mask.all():
+            write_png(folder / f"{name}.png", np.stack([mask] * 3, axis=-1))
 
 
 def run_sfm(folder):
@@ -1706,18 +1604,21 @@ def run_sfm(folder):
           f"{folder} has sparse/ or dense/, a model: leave --sfm out, or delete that")
     files = sfm_photos(images)
     masks = mask_files(images, files)
-    pycolmap = import_pycolmap()
-    work = DATA / f"sfm-{checksum(files, masks):08x}"
+    try:
+        import pycolmap  # an extra
+        reader = pycolmap.ImageReaderOptions()
+        features = pycolmap.FeatureExtractionOptions()
+        matching = pycolmap.FeatureMatchingOptions()
+    except (ImportError, AttributeError) as e:  # missing, or too old
+        raise UserError(f'--sfm needs pycolmap ({e}): run pip install "pycolmap>=3.13"') from e
+    work = DATA / f"sfm-{checksum([*files.values(), *masks.values()]):08x}"
     database = work / "database.db"
-    reader = pycolmap.ImageReaderOptions()
     (work / "masks").mkdir(parents=True, exist_ok=True)
     write_sfm_masks(files, masks, work / "masks")
     reader.mask_path = work / "masks"
     # Of 135 photos of a statue in all lights these options pose 104 in one model, not 60.
-    features = pycolmap.FeatureExtractionOptions()
     features.sift.estimate_affine_shape = True
     features.sift.domain_size_pooling = True
-    matching = pycolmap.FeatureMatchingOptions()
     matching.guided_matching = True
     with tempfile.TemporaryDirectory(prefix=".sparse", dir=folder) as temporary:
         models = Path(temporary, "models")
@@ -1731,8 +1632,7 @@ def run_sfm(folder):
         except (RuntimeError, ValueError) as e:
             message = f"pycolmap failed ({e}): delete {work}, which may be damaged, and retry"
             raise UserError(message) from e
-        check(found,
-              f"the photos in {folder} do not match each other; take more, with more overlap")
+        check(found, f"the photos in {folder} do not match: take more, with more overlap")
         models.rename(sparse)
     shutil.rmtree(work)
 

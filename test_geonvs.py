@@ -165,9 +165,11 @@ def test_progress_is_told_after_ten_seconds(is_terminal, seconds, told, monkeypa
     monkeypatch.setattr(data_prep, "time", SimpleNamespace(monotonic=clock.__next__))
     monkeypatch.setattr(sys.stdout, "isatty", lambda: is_terminal, raising=False)
     assert list(data_prep.progress(range(5), "counting")) == list(range(5))
-    lines = [f"  counting: {done} of 5, {(5 - done) * seconds:.0f} s left " for done in told]
-    wanted = "".join(f"\r{line}" if is_terminal else f"{line}\n" for line in lines)
-    assert capsys.readouterr().out == wanted + "\n" * (is_terminal and told != [])
+    wanted = ""
+    for done in told:
+        end = "\r" if is_terminal and done < 5 else "\n"
+        wanted += f"  counting: {done} of 5, {(5 - done) * seconds:.0f} s left {end}"
+    assert capsys.readouterr().out == wanted
 
 
 def zipped(scene, save=np.savez):
@@ -301,19 +303,22 @@ def ball(count):
     return x[lengths(x) < 1][:count]
 
 
+def black_photo(track, mask, is_test=False, K=(20, 20, 20, 20)):
+    """A photo by a camera at the origin, whose axis meets a corner of 20 x 20 pixels."""
+    image = np.zeros((*mask.shape, 3), np.uint8)
+    return data_prep.Photo("a", image, mask, np.array(K), np.eye(3, 4), track, is_test)
+
+
 def scene_of_points(
         xyz, views=20, tracks=None, is_test=(False, False, False), error=0, contain=(),
-        size=20, masks=None):
+        masks=np.zeros((3, 20, 20), bool)):
     """The scene of three black photos that see these points: all of them, unless said."""
     if tracks is None:
         tracks = [np.arange(len(xyz))] * 3
-    images = np.zeros((3, size, size, 3), np.uint8)
-    K = np.full((3, 4), 20)  # f = cx = cy = 20: the axis meets a corner of a 20 px photo
-    c2w = [np.eye(3, 4)] * 3
+    photos = [black_photo(*row) for row in zip(tracks, masks, is_test)]
     zero = np.zeros(len(xyz))
     points = np.column_stack([xyz, zero + error, zero + views])
-    return data_prep.build_scene(
-        images, K, c2w, is_test, ["a"] * 3, points, tracks, {}, contain, masks)
+    return data_prep.build_scene(photos, points, {}, contain)
 
 
 BALL_SCALE = 1.1 * .95 ** (1 / 3)  # 1.1 x the radius that holds 95 % of a uniform ball
@@ -377,7 +382,7 @@ def test_points_that_most_photos_mask_are_not_there(masked_photos, share):
     xyz = np.random.default_rng(0).uniform((-8, -8, 8), (0, 0, 8), (600, 3))
     masks = np.zeros((3, 20, 20), bool)
     masks[:masked_photos, :, :10] = True  # where x < -4
-    scene = scene_of_points(xyz, masks=list(masks))
+    scene = scene_of_points(xyz, masks=masks)
     x = world(scene, scene["points"])[:, 0]
     assert (x.min() > -4.01) == (share < 1)
     assert abs(len(x) / 600 - share) < .06
@@ -389,12 +394,13 @@ def test_points_that_most_photos_mask_are_not_there(masked_photos, share):
 def test_a_sighting_is_masked_by_its_own_pixel():
     mask = np.zeros((20, 40), bool)  # 40 px wide
     mask[5:, 30:] = True
-    K = np.array([20, 20, 20, 10])
     x = np.random.default_rng(0).uniform((-1, -.5, 1), (1, .5, 1), (300, 3))
     u, v, _ = (20 * x + (20, 10, 0)).T
     track = np.arange(0, 300, 2)
-    kept = data_prep.unmasked(track, mask, K, np.eye(3, 4), x)
-    assert np.array_equal(kept, track[~((u > 30) & (v > 5))[track]])
+    photo = black_photo(track, mask, K=(20, 20, 20, 10))
+    is_kept = data_prep.drop_masked([photo, black_photo(track, mask & False)], x)
+    assert np.array_equal(photo.track, track[~((u > 30) & (v > 5))[track]])
+    assert is_kept.all()  # half of the sightings are enough
 
 
 def test_near_footprint_and_sightings_follow_the_points():
@@ -424,7 +430,7 @@ def test_background_is_what_sixty_percent_agree_on(size, black, masked, color):
     masks = np.zeros((3, size, size), bool)
     masks[0].ravel()[black:black + masked] = True
     scene = scene_of_points(  # all rays miss the sphere
-        ball(500) + [9, 9, 9], is_test=[False, True, True], size=size, masks=list(masks))
+        ball(500) + [9, 9, 9], is_test=[False, True, True], masks=masks)
     noise = np.random.default_rng(0).integers(9, 255, (3 * size * size, 3))
     scene["rgb"][black:] = noise[black:]
     assert_arrays_close(data_prep.add_statistics(scene)["bg_color"], [color] * 3)
@@ -576,12 +582,11 @@ def test_a_photo_is_known_by_its_content(model):
     write_model(model)
     found = data_prep.photo_files(IMAGES)
     assert found.keys() == {*names, *toy()["name"]}
-    assert data_prep.find_model(Path("place"), "").count == 8
+    assert data_prep.find_model(Path("place")).count == 8
 
 
 def test_the_largest_model_is_taken_and_leftovers_told(model):
     shutil.copy(PHOTO, IMAGES / "more.JPG")
-    put(MASKS / "other.png", encoded(BLACK + 255))
     Path(IMAGES, "toy_003.png").rename(IMAGES / "toy_003.jpeg")
     model.camera_ids[:] = 99  # a fisheye
     write_model(model, Path("place/fisheye"))
@@ -592,8 +597,6 @@ def test_the_largest_model_is_taken_and_leftovers_told(model):
     assert re.findall("left out is another model: (.*)", out) == ["4 posed by place/part"]
     assert "1 photos of place/sparse are not on disk, such as 'toy_003.png'; there is " in err
     assert "'toy_003.jpeg'" in err
-    assert "no name in it, such as other.png, is a photo's" in err
-    assert "masked" not in scene
 
 
 def test_the_cameras_of_photos_shrink_with_them(model):
@@ -641,6 +644,17 @@ def jpeg(image, tag, mode="RGB"):
     file = io.BytesIO()
     picture = Image.fromarray(np.uint8(image)).convert(mode)
     picture.save(file, "JPEG", exif=exif, quality=98, subsampling=0)
+    return file.getvalue()
+
+
+def grey_with_alpha(kind):
+    """A photo of 24 x 32 pixels whose upper quarter is transparent."""
+    from PIL import Image
+    alpha = np.full((32, 24), 255, np.uint8)
+    alpha[:8] = 85
+    grey = Image.fromarray(alpha)
+    file = io.BytesIO()
+    Image.merge("LA", [grey, grey]).save(file, kind)
     return file.getvalue()
 
 
@@ -697,7 +711,7 @@ def new(path, content="x"):
     no_views=(change("views", ..., 0), "run colmap point_triangulator"),
     no_cameras=(change("camera_ids", ..., 99), "run colmap image_undistorter"),
     unknown_camera=(change("cameras", 0, [77, 0, 0]), "run colmap image_undistorter"),
-    name_twice=(change("names", 0, "toy_001.png"), "'toy_001.png' occurs twice"),
+    name_twice=(change("names", 0, "toy_001.png"), "'toy_001.png', which occurs twice"),
     name_of_root=(change("names", 0, "/toy_000.png"), "outside"),
     name_above=(change("names", 0, "..\\toy_000.png"), "outside"),
     wrong_poses=(change("poses", (slice(6), 4), 99), "6 of 8 photos miss most of their points"),
@@ -708,12 +722,13 @@ def new(path, content="x"):
     no_images=(move(IMAGES), "such as 'toy_000.png': put them into place/images"),
     no_model=(move(SPARSE), "run python data_prep.py place --sfm"),
     one_photo=(new(TABLE, "filename\tsplit\ntoy_000.png\ttrain"), "1 usable training photos"),
-    two_tables=(new("place/b.tsv", "filename\tsplit"), "--split: place/b.tsv, place/toy.tsv"),
+    two_tables=(new("place/b.tsv", "filename\tsplit\nx\ttest"), "--split: place/b.tsv, place/toy"),
     half_a_split=(move(TABLE, "place/train.txt"), "place/test.txt is missing"),
-    short_row=(new(TABLE, "split\tfilename\ntrain\n"), "toy.tsv: None is 'train'"),
-    no_name=(new(TABLE, "filename\tsplit\n\ttrain\n"), "toy.tsv: '' is 'train'"),
-    other_part=(new(TABLE, "filename\tsplit\nx\tvalid\n"), "toy.tsv: 'x' is 'valid'"),
-    both_parts=(new(TABLE, "filename\tsplit\nx\ttrain\nx\ttest\n"), "toy.tsv: 'x' is 'test'"))
+    short_row=(new(TABLE, "split\tfilename\ntrain\n"), "filename None has split 'train'"),
+    no_filename=(new(TABLE, "id\tsplit\n1\ttrain"), "filename None has split 'train'"),
+    no_name=(new(TABLE, "filename\tsplit\n\ttrain\n"), "toy.tsv: filename '' has split 'train'"),
+    other_part=(new(TABLE, "filename\tsplit\nx\tvalid\n"), "filename 'x' has split 'valid'"),
+    both_parts=(new(TABLE, "filename\tsplit\nx\ttrain\nx\ttest\n"), "'x' has split 'test'"))
 def test_a_bad_folder_is_refused(model, spoil, says):
     spoil(model)
     assert_error(says, "place")
@@ -721,12 +736,6 @@ def test_a_bad_folder_is_refused(model, spoil, says):
 
 def test_the_folder_around_images_is_named(model, in_tmp_dir):
     assert_error(f"the folder around it has: give {in_tmp_dir}/place", "place/images")
-
-
-@pytest.mark.parametrize("text", ["", "filename\tid\n", "id\tsplit\n"])
-def test_a_split_table_needs_its_header(model, text):
-    put(TABLE, text)
-    assert_error("toy.tsv needs a header", "place --split place/toy.tsv")
 
 
 HEIC = b"\0\0\0\x18ftypheic" + bytes(99)
@@ -746,17 +755,20 @@ def dangle(model):
     no_camera=(change("camera_ids", 0, 12345), "no camera in the model"),
     panorama=(change("cameras", 0, [1, 33000, 9, 99, 99, 9, 9]), "is 33000 x 9 pixels, too large"),
     wrong_pose=(change("poses", (0, 4), 99), "shows 0% of its points"),
-    folding=(change("cameras", 0, [2, 24, 32, 26, 12, 16, 300]), "its pose or its distortion"),
-    empty=(new(PHOTO, b""), "is empty, damaged, too large or no photo"),
+    folding=(change("cameras", 0, [2, 24, 32, 26, 12, 16, 300]), "wrong pose or distortion"),
+    empty=(new(PHOTO, b""), "is empty, damaged, too large or of an unknown type"),
     heic=(new(PHOTO, HEIC), "is HEIC, which cannot be read"),
     cut_png=(new(PHOTO, encoded(BLACK)[:-20]), "is cut off"),
     cut_jpeg=(new(PHOTO, encoded(BLACK, ".jpg")[:-20]), "is cut off"),
     small=(new(PHOTO, encoded(BLACK[:7, :9], ".jpg")), "has 9 x 7 pixels, its camera 24 x 32"),
     turned=(new(PHOTO, jpeg(BLACK.T, 1)), "has 32 x 24 pixels, its camera 24 x 32"),
-    small_and_turned=(new(PHOTO, jpeg(BLACK[:7, :9], 6)), "9 x 7 pixels, 7 x 9 by its EXIF"),
     dangling=(dangle, "is a broken link"),
-    black_mask=(new(MASKS / "toy_000.png", encoded(BLACK)), "is black all over"),
-    nearly_black=(new(MASKS / "toy_000.png", encoded(BLACK + 1)), "is black all over"),
+    black_mask=(new(MASKS / "toy_000.png", encoded(BLACK)), "is black or transparent all over"),
+    nearly_black=(new(MASKS / "toy_000.png", encoded(BLACK + 1)), "is black or transparent all"),
+    transparent=(new(PHOTO, encoded(np.zeros((32, 24, 4)))), "is black or transparent all over"),
+    grey_tiff=(new(PHOTO, grey_with_alpha("TIFF")), "is a grey TIFF with alpha, which cannot be"),
+    other_folder=(new("place/mask/toy_000.png", encoded(BLACK)), "place/mask is not used"),
+    other_names=(new(MASKS / "mask_0.png", encoded(BLACK)), "unlike mask_0.png"),
     turned_mask=(new(MASKS / "toy_000.png", encoded(BLACK.T + 255)), "32 x 24 pixels, its photo"))
 def test_what_cannot_be_used_is_named(model, spoil, says):
     spoil(model)
@@ -775,14 +787,14 @@ def test_a_photo_of_an_unknown_type_is_named(model):
     TABLE.unlink()
     scene, out, err = made()
     assert "8 photos on disk, 8 posed" in out
-    assert err.startswith("left out: toy_000.dng is empty, damaged, too large or no photo")
+    assert err.startswith("left out: toy_000.dng is empty, damaged, too large or of an unknown type")
 
 
 def test_bad_photos_are_found_in_one_go(model):
     change("poses", [0, 4, 6], np.nan)(model)
     code, out, err = run_main("place")
     assert code == 2
-    assert re.findall("left out: (.*).png has", err) == ["toy_000", "toy_004", "toy_006"]
+    assert re.findall("left out: (.*).png has", err) == ["toy_006", "toy_000", "toy_004"]
     assert err.endswith("repair them or hold out others: ['toy_006.png']\n")
 
 
@@ -902,11 +914,11 @@ TOY_000.png\t1\ttrain
 toy_003.png\t2\ttrain
 toy_005.png\t3\ttest
 toy_004.png\t\ttrain
-my_toy007.png\t4\ttrain
+my/toy_007.png\t4\ttrain
 a ghost\t5\ttrain
 """
 LISTS = {
-    "train_list.txt": "\ufeffTOY_000.png\r\ntoy_003.png\r\n\r\nmy_toy007.png\r\na ghost",
+    "train_list.txt": "\ufeffTOY_000.png\r\ntoy_003.png\r\n\r\nmy/toy_007.png\r\na ghost",
     "test_list.txt": "toy_005.png"}
 
 
@@ -919,7 +931,7 @@ LISTS = {
     commas=({"nerfw_split.csv": ROWS.replace("\t", ",")}, "", "nerfw_split.csv"),
     semicolons=({"s.csv": ROWS.replace("\t", ";")}, "", "s.csv"),
     quoted=({"s.csv": re.sub(r"([^\t\n]+)", r'"\1"', ROWS).replace("\t", ",")}, "", "s.csv"),
-    one_of_two=({"s.tsv": "split\tfilename", "t.tsv": ROWS}, "--split place/t.tsv", "t.tsv"),
+    one_of_two=({"s.tsv": ROWS, "t.tsv": ROWS}, "--split place/t.tsv", "t.tsv"),
     named_elsewhere=({"../mine.tsv": ROWS}, "--split mine.tsv", "mine.tsv"),
     lists=(LISTS, "", "train_list.txt"),
     named_list=(LISTS, "--split place/test_list.txt", "train_list.txt"))
@@ -934,7 +946,7 @@ def test_a_split_is_found_read_and_remembered(model, files, flags, first):
     assert scene["name"].tolist() == ["toy_000.png", "toy_003.png", "toy_005.png"]
     assert scene["is_test"].tolist() == [False, False, True]
     assert "5 photos are not in" in err
-    assert "left out: my_toy007.png has no pose; there is 'toy_007.png'\n" in err
+    assert "left out: my/toy_007.png has no pose; there is 'toy_007.png'\n" in err
     assert "left out: a ghost has no pose\n" in err
     put("place/images/toy_001.png", "another photo")
     assert_same_arrays(data_prep.open_scene("place"), scene, "name", "is_test")
@@ -965,7 +977,6 @@ def touch_all(model):
     notes=(new("place/notes.txt"), False),
     table_without_split=(new("place/notes.csv"), False),
     photo_without_pose=(new(IMAGES / "without_pose.png"), False),
-    folder_of_model_renamed=(move(SPARSE, "place/other"), False),
     sources_gone=(move(Path("place")), False),
     other_size=(lambda model: data_prep.open_scene("place", 4), True),
     other_photo=(append(PHOTO), True),
@@ -974,7 +985,7 @@ def touch_all(model):
     other_points=(append(SPARSE / "points3D.bin"), True),
     other_split=(append(TABLE), True),
     new_mask=(new(MASKS / "toy_000.png", encoded(BLACK)), True),
-    photo_deleted=(lambda model: PHOTO.unlink(), True),
+    photo_renamed=(move(PHOTO, IMAGES / "other.png"), True),
     second_model=(lambda model: write_model(model, Path("place/more")), True))
 def test_a_scene_follows_its_sources_content(model, happens, is_made, capsys):
     data_prep.open_scene("place")
@@ -1014,22 +1025,23 @@ def test_scenes_known_by_name_lie_in_data(in_tmp_dir, home):
 BLACK_LEFT = np.repeat([[0, 255]], 24, 1)[[0] * 64]  # twice as large as the photo (64,48)
 
 
-@pytest.mark.parametrize("folder", [IMAGES / "masks", MASKS], ids=["within", "beside"])
-@pytest.mark.parametrize("name, mask_name", [
-    ("toy_000.png", "toy_000.png"),
-    ("toy_000.jpg", "toy_000.png"),
-    ("toy_000.JPG", "TOY_000.PNG"),
-    ("toy_000.jpg", "toy_000.jpg.png"),
-    ("toy_000.jpg", "toy_000.jpg")])
-def test_black_pixels_of_masks_are_left_out(model, folder, name, mask_name):
+@cases(
+    "name, mask",
+    beside=("toy_000.png", "place/masks/toy_000.png"),
+    within=("toy_000.png", "place/images/masks/toy_000.png"),
+    in_capitals=("toy_000.JPG", "place/MASKS/TOY_000.PNG"),
+    of_the_stem=("toy_000.jpg", "place/masks/toy_000.png"),
+    of_the_name=("toy_000.jpg", "place/masks/toy_000.jpg.png"),
+    of_the_same_name=("toy_000.jpg", "place/images/masks/toy_000.jpg"))
+def test_black_pixels_of_masks_are_left_out(model, name, mask):
     change("names", 0, name)(model)
     PHOTO.rename(IMAGES / name)
     TABLE.unlink()
-    put(folder / mask_name, encoded(BLACK_LEFT, Path(mask_name).suffix))
+    put(mask, encoded(BLACK_LEFT, Path(mask).suffix))
     scene, out, err = made()
     share = scene["masked"].mean()
     assert "8 photos on disk" in out
-    assert f"1 of 8 photos have a mask: {share:.0%} of all pixels are black" in out
+    assert f"masks leave out {share:.0%} of all pixels, in 1 of 8 photos" in out
     assert photo(scene, 0, "masked")[:, :6].all()
     assert scene["masked"].sum() == 16 * 6
     assert "every eighth photo" in out
@@ -1049,12 +1061,12 @@ def with_alpha(kind, dtype=np.uint8):
     png_of_16_bits=(with_alpha(".png", np.uint16), 1 / 4),
     tiff=(with_alpha(".tiff"), 1 / 4),
     webp=(with_alpha(".webp"), 1 / 4),
-    opaque=(encoded(np.full((32, 24, 4), 255)), 0),
-    transparent=(encoded(np.zeros((32, 24, 4))), 0))
+    grey=(grey_with_alpha("PNG"), 1 / 4),
+    opaque=(encoded(np.full((32, 24, 4), 255)), 0))
 def test_an_alpha_channel_is_a_mask(model, file, share):
     put(PHOTO, file)
     scene, out, err = made("--downscale 1")
-    assert ("1 of 8 photos have a mask" in out) == (share > 0)
+    assert ("in 1 of 8 photos" in out) == (share > 0)
     assert scene.get("masked", np.zeros(1)).sum() == share * 32 * 24
 
 
@@ -1109,7 +1121,12 @@ def test_distances_to_parts_equal_closed_forms(shape, top, x, distance):
     assert_arrays_close(data_prep.part_sdf(part, np.array([center + x])), distance)
 
 
-@cases("i, knobs", town=(4, {}), alone=(3, dict(background=False)), other=(2, dict(landmark=4)), facade=(1, dict(landmark=-1)))
+@cases(
+    "i, knobs",
+    town=(4, {}),
+    alone=(3, dict(background=False)),
+    other=(2, dict(landmark=4)),
+    facade=(1, dict(landmark=-1)))
 def test_depth_is_where_the_distance_vanishes(i, knobs):
     scene = toy(**knobs)
     c2w = scene["c2w"][i]
@@ -1361,13 +1378,15 @@ def test_sfm_calls_pycolmap_in_order(pycolmap):
 def test_a_second_sfm_takes_up_the_first(pycolmap):
     put(MASKS / "toy_000.png", encoded(BLACK_LEFT))
     put(MASKS / "toy_001.png", "no image")
+    put(IMAGES / "toy_003.png", with_alpha(".png"))
     works = pycolmap.incremental_mapping.side_effect
     pycolmap.incremental_mapping.side_effect = OSError(28, "No space left")
     assert_error("No space left", "place --sfm")
     assert sorted(os.listdir("place")) == ["images", "masks", "toy.tsv"]
-    (mask,) = Path("data").rglob("masks/*")
+    mask, transparent = sorted(Path("data").rglob("masks/*"))
     assert mask.name == "toy_000.png.png"  # COLMAP's name
     assert np.array_equal(cv2.imread(str(mask), cv2.IMREAD_GRAYSCALE), BLACK_LEFT[::2, ::2])
+    assert (cv2.imread(str(transparent), cv2.IMREAD_GRAYSCALE) == 0).mean() == 1 / 4
     pycolmap.incremental_mapping.side_effect = works
     made("--sfm")
     first, second = pycolmap.extract_features.call_args_list
@@ -1375,20 +1394,11 @@ def test_a_second_sfm_takes_up_the_first(pycolmap):
     assert second[1]["reader_options"].mask_path == mask.parent
 
 
-def test_sfm_leaves_out_transparent_pixels(pycolmap):
-    put(PHOTO, with_alpha(".png"))
-    pycolmap.incremental_mapping.side_effect = OSError(28, "No space left")
-    assert_error("No space left", "place --sfm")
-    (mask,) = Path("data").rglob("masks/*")
-    assert mask.name == "toy_000.png.png"
-    assert (cv2.imread(str(mask), cv2.IMREAD_GRAYSCALE) == 0).mean() == 1 / 4
-
-
 def test_renamed_photos_are_matched_anew(model):
     first, second = Path("place/images/toy_000.png"), Path("place/images/toy_001.png")
-    sums = [data_prep.checksum({name: first}, masks) for name, masks in [
-        ("a.png", {}), ("b.png", {}), ("a.png", {"a.png": second})]]
-    assert len(set(sums)) == 3
+    sums = [data_prep.checksum(paths) for paths in ([first], [second], [first, second])]
+    copy = shutil.copy(first, "copy.png")
+    assert len({*sums, data_prep.checksum([Path(copy)])}) == 4
 
 
 def test_sfm_asks_for_its_place_first(pycolmap, monkeypatch):
@@ -1407,12 +1417,12 @@ def fail(function, error):
     has_model=(new(SPARSE / "0/images.bin"), "place has sparse/ or dense/, a model: leave --sfm"),
     no_photos=(move(IMAGES), "place has no photos"),
     damaged=(fail("extract_features", RuntimeError("no table")), "(no table): delete data/sfm"),
-    heic=(new(IMAGES / "phone.jpg", HEIC), "1 photos are HEIC, such as ['phone.jpg']"),
+    heic=(new(IMAGES / "phone.jpg", HEIC), "phone.jpg is HEIC: convert all such photos"),
     no_utf8=(move(PHOTO, IMAGES / "\udcff.png"), "is not UTF-8: rename the photo"),
     no_pycolmap=(lambda model: sys.modules.update(pycolmap=None), 'run pip install "pycolmap>='),
-    old_pycolmap=(lambda model: sys.modules.update(pycolmap=SimpleNamespace(__version__="3.10")),
-                  'pycolmap 3.10 is too old: run pip install "pycolmap>=3.13"'),
-    no_match=(lambda model: None, "do not match each other"))
+    old_pycolmap=(lambda model: sys.modules.update(pycolmap=SimpleNamespace()),
+                  'no attribute \'ImageReaderOptions\'): run pip install "pycolmap>=3.13"'),
+    no_match=(lambda model: None, "do not match: take more"))
 def test_sfm_tells_what_is_wrong(pycolmap, model, spoil, says):
     pycolmap.incremental_mapping.side_effect = lambda *_: {}
     spoil(model)
