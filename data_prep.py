@@ -616,7 +616,10 @@ def name_hint(name, names):
 def mask_folders(images):
     """Folders with "mask" in their name, in the folder of photos and beside it; masks/ first."""
     folders = []
-    for place in (images, images.parent):
+    places = [images, images.parent]
+    if images.parent.name == "dense":
+        places.append(images.parent.parent)
+    for place in places:
         folders += [path for path in place.glob("*[mM][aA][sS][kK]*") if path.is_dir()]
     return sorted(folders, key=lambda path: path.name.lower() != "masks")
 

@@ -1048,6 +1048,13 @@ def test_black_pixels_of_masks_are_left_out(model, name, mask):
     assert scene["is_test"].tolist() == [False] * 7 + [True]
 
 
+def test_masks_may_lie_beside_dense(in_tmp_dir):
+    for name in ("dense/images", "masks", "maps"):
+        Path("place", name).mkdir(parents=True)
+    assert data_prep.mask_folders(Path("place/dense/images")) == [Path("place/masks")]
+    assert data_prep.mask_folders(Path("place/dense/images/masks")) == []
+
+
 def with_alpha(kind, dtype=np.uint8):
     """A photo of 24 x 32 pixels whose upper quarter is transparent."""
     image = np.full((32, 24, 4), np.iinfo(dtype).max, dtype)
