@@ -3942,7 +3942,7 @@ def draw():
     high = math.ceil(len(paths) / 2)
     figure = Figure(figsize=(13, 4.2 * high), layout="constrained")
     for number, path in enumerate(paths):
-        axis = figure.add_subplot(high, 2, number + 1, title=path.stem)
+        axis = figure.add_subplot(high, 2, number + 1, title=path.stem.removeprefix("chart-"))
         draw_chart(axis, read_table(path))
     data_prep.atomic_write(Path("chart.png"), lambda part: figure.savefig(part, dpi=110))
     print("wrote chart.png")
