@@ -16,11 +16,11 @@ The paper's equations, and the forms as printed that `--paper` trains with
   Eq. 2  compositing weights        composite
   Eq. 3  geometry preservation      gpl_loss
   Eq. 4  edge indicator Phi         edge_indicator, complexity, SDFCache       paper_phi
-  Eq. 5  objective                  objective, of GeoNVS.losses
+  Eq. 5  objective                  objective, called by GeoNVS.losses
          L_rgb, L_eik, L_curv       GeoNVS.losses; eikonal, finite_differences
          L_reg                      mask_loss                                  paper_mask_loss
          L_lps                      lipschitz_loss
-         off-surface penalty        off_surface_loss, of air_segments
+         off-surface penalty        off_surface_loss, at points of air_segments
 
 Conventions
   world     the foreground is the unit sphere; x * scale + center leads back to SfM units
@@ -33,32 +33,33 @@ Conventions
   shapes    R rays, S intervals of a ray (S + 1 samples), K intervals or points on a ray, P points,
             N octree cells, L octree levels, C channels per level, V feature rows, G inputs of the
             colour network from geometry, A appearance dims, I photos in all, B of them in a batch,
-            Q SfM points, T their sightings, m side of a mask, "." any length
+            Q SfM points, T sightings, m side of a mask, n as the line says, "." any length
 
 Departures from the printed paper. The tag stands at the code; .github/RESULTS.md says what each
 one is worth.
-  tag   in the paper                       here                               because
-  [D1]  alpha: a difference of sigmoids    NeuS's Eq. 13, s at both ends      printed, a surface lets
-        with a slope beta                  of an interval                     37 % of the light through
-  [D2]  E_curv = |lap s|; Phi on every     |lap s| times the step; L_eik,     |lap s| grows without
-        ray                                L_curv, Phi weighted by opacity    bound where the grid is fine
-  [D3]  L_reg: intensity and bimodality    M classifies rays by their error   printed, M takes a sky that
-        of M, which L_rgb trains, too      at that place; outliers are        one network cannot fit
-                                           rejected early; M fixed at 60 %
-  [D4]  CGNet                              a block a stage, GroupNorm, a      photos are small, batches
-                                           head at each resolution            have 8 of them
-  [D5]  a sphere loss in a warm-up         SfM points place the sphere, seed  a ball of air before a
-                                           the octree, pull s and M to 0,     facade never vanishes
-                                           and say what is air
-  [D6]  derivatives at every sample, no    at a surface point a ray, whose    five lookups a sample;
-        normal as an input                 normal colours see, and at SfM     normals help photos by
-                                           points; samples and Phi follow     half a decibel
-                                           a cached SDF
-  [D7]  zeta is learned                    within bounds, the lower rises     else surfaces stay soft,
-                                                                              and people get painted
-  [D8]  octrees are pruned                 cells split where colours err;     empty cells cost nothing;
-                                           parts that a scene does not        what is not there cannot
-                                           need are off                       fail
+  tag   in the paper                   here                              because
+  [D1]  alpha: a difference of         NeuS's Eq. 13, with s at both     printed, a surface lets 37
+        sigmoids with a slope beta     ends of an interval               % of the light pass
+  [D2]  E_curv = |lap s|; Phi on       |lap s| times the step; L_eik,    |lap s| grows without bound
+        every ray                      L_curv, Phi are weighted by       on fine grids
+                                       opacity
+  [D3]  L_reg: intensity and           M classifies rays by their error  printed, M takes skies;
+        bimodality of M, which L_rgb   at a place; early outliers are    errors of memorised people
+        trains, too                    rejected; M is fixed at 60 %      are small
+  [D4]  CGNet                          a block a stage, GroupNorm, a     photos are small, eight in
+                                       head at each resolution           a batch
+  [D5]  a sphere loss in a warm-up     SfM points place the sphere,      else the first sphere stays
+                                       seed the octree, pull s and M to  as a lump before a facade
+                                       0, and say what is air
+  [D6]  derivatives at every sample;   at one surface point per ray, at  each costs five lookups;
+        no normal as an input          SfM points and in air; colours    the normal is worth half a
+                                       see the normal; samples and Phi   decibel on photos
+                                       follow a cached SDF
+  [D7]  zeta is learned                within bounds, of which the       else surfaces stay soft and
+                                       lower one rises                   people get painted
+  [D8]  octrees are pruned             cells split where colours err;    empty cells cost nothing
+                                       what a scene does not need is
+                                       off
 """
 import argparse
 import contextlib
@@ -131,7 +132,7 @@ class Config:
     appearance: str = setting("auto", "codes: on, off, auto (if exposures differ)", choices=SWITCH)
     mask: str = setting("on", "transient mask: on, off", choices=("on", "off"))
     background: str = setting("auto", "a field: on, off, auto (unless one colour)", choices=SWITCH)
-    paper: str = setting("", f"as printed: all or {','.join(PRINTED)}", alone=",".join(PRINTED))
+    paper: str = setting("", f"as printed: {','.join(PRINTED)}; bare: all", alone=",".join(PRINTED))
     lam_eik: float = setting(0.004, "L_eik, eikonal (Permuto-SDF: 0.04)")
     lam_curv: float = setting(0.01, "L_curv, curvature: |lap s| eps [D2]")
     lam_mask: float = setting(1.0, "L_reg, which trains the mask [D3]")
@@ -169,15 +170,15 @@ class Config:
         return name in self.paper.split(",")
 
 
-# Photos on a GPU, where flags do not say otherwise. A step there takes as long with fewer rays.
+# Photos on a GPU, where flags do not say otherwise. Fewer rays would not make its steps faster.
 GPU_DEFAULTS = dict(steps=75_000, rays=16_384, photos=16, samples=32, appearance_dim=32)
 
 
 @dataclass
 class Processes:
-    """The processes that torchrun started, or this one alone. Each draws its own rays and follows
-    its own quantiles. Gradients are averaged, and the first process decides, speaks and writes; so
-    all hold the same weights."""
+    """The processes that torchrun started, or this one alone. Each process draws its own rays and
+    keeps its own error quantiles (UsualErrors). Gradients are averaged, so all hold the same
+    weights. The first process prints and saves."""
     count: int = 1
     rank: int = 0
     local_rank: int = 0  # on this machine: the number of the process's GPU
@@ -433,9 +434,9 @@ class Octree(nn.Module):
         o---o---o
 
     So the features of a level fade to 0 at the border of what it refines, and are continuous. Where
-    a level has no cell, its features are 0. A cell is a row of `cells`; `child` has the row of its
-    first child, `corner` those of its eight features. `corner_key` names the corner of each
-    feature, so that features survive a rebuild."""
+    a level has no cell, its features are 0. `cells[n]` is cell n; `child[n]` is the row of its
+    first child, and `corner[n]` holds the feature rows of its eight corners. `corner_key` names the
+    corner of each feature, so that features survive a rebuild."""
     def __init__(self, half, levels, channels=4, root=ROOT):
         super().__init__()
         self.half = half
@@ -446,7 +447,7 @@ class Octree(nn.Module):
         self.resolution = nn.Buffer(resolution, persistent=False)  # (L,) cells along an axis
         self.features = torch.zeros(0, channels)  # (V,C), none yet; build makes it a parameter
         self.corner_key = nn.Buffer(torch.arange(0), persistent=False)
-        self.build(self.corner_key)  # no cell is split
+        self.build(torch.arange(0))  # no cell is split
 
     @property
     def side(self):
@@ -566,9 +567,9 @@ def cells_to_split(octree):
     error, pixel, count = octree.cell_error.T  # (N,) sums over rays
     is_coarse = pixel < count * octree.side[level] / 2  # mean size of a pixel under a child's side
     can_split = is_coarse & (level < octree.levels - 1)
-    found, worst = (error * can_split).sort(descending=True)  # (N,)
-    error_before = found.cumsum(0) - found  # (N,) in worse cells
-    is_chosen = error_before < SPLIT_SHARE * found.sum()
+    error, worst = (error * can_split).sort(descending=True)  # (N,)
+    error_before = error.cumsum(0) - error  # (N,) in worse cells
+    is_chosen = error_before < SPLIT_SHARE * error.sum()
     room = max(MAX_CELLS - len(level), 0) // (7 * 8)  # six neighbours are split with each
     if is_chosen.sum() > room:
         print(f"  the octree is full: {len(level)} cells of {MAX_CELLS}, so it is refined less")
@@ -578,7 +579,7 @@ def cells_to_split(octree):
 # ---- 4 Fields: the networks on top of the octree -------------------------------------------------
 
 GEOMETRY_FEATURES = 15  # that the SDF network hands to the colour network
-START_RADIUS = 0.25  # of the sphere that s starts as, inside the landmark to which it grows [D5]
+START_RADIUS = 0.25  # of the initial sphere, from which the surface grows to the landmark [D5]
 
 
 @functools.cache
@@ -643,8 +644,8 @@ def off_surface_loss(sdf, margin):
 
 class SDFField(nn.Module):
     """s(x) and the inputs of the colour network: a geometry feature beside the octree's features.
-    One hidden layer over xyz and features; G = GEOMETRY_FEATURES + L C. The network learns what is
-    to be added to the distance from a small sphere. In float32 on every device."""
+    One hidden layer over xyz and features; G = GEOMETRY_FEATURES + L C. The network
+    predicts an offset to the SDF of a small sphere. In float32 on every device."""
     def __init__(self, octree, hidden):
         super().__init__()
         self.octree = octree
@@ -686,7 +687,7 @@ class LipschitzLinear(nn.Linear):
 
 
 def lipschitz_loss(network):
-    """L_lps: the network's Lipschitz bound, which is the product of its layers' (Liu et al. 2022)."""
+    """L_lps: the network's Lipschitz bound, the product of its layers' (Liu et al. 2022)."""
     return math.prod(layer.bound() for layer in network[::2])
 
 
@@ -700,8 +701,8 @@ def neus_alpha(sdf, zeta):
     """Opacity (R,S) of the intervals between samples with SDF (R,S+1). Eq. 1 corrected: alpha_i =
     max(0, 1 - sigmoid(zeta s_{i+1}) / sigmoid(zeta s_i)), which is NeuS Eq. 13. As s is taken at
     both ends of an interval, no slope beta is needed. [D1]"""
-    log_phi = F.logsigmoid(zeta * sdf)  # (R,S+1), which does not overflow
-    fall = log_phi.diff().clamp_max(0)  # (R,S) 0 where the ray leads outwards
+    log_sigmoid = F.logsigmoid(zeta * sdf)  # (R,S+1), which does not overflow
+    fall = log_sigmoid.diff().clamp_max(0)  # (R,S) 0 where the ray leads outwards
     return -fall.expm1()
 
 
@@ -755,11 +756,12 @@ def importance_samples(probes, alpha, jitter):
 
 
 class SDFCache(nn.Module):
-    """s, E_grad and E_curv on a dense grid, renewed every CACHE_EVERY steps. It guides where samples
-    lie along a ray [D6] and gives the complexity of the geometry along it (Eq. 4)."""
+    """s, E_grad and E_curv on a dense grid, renewed every CACHE_EVERY steps. It says where samples
+    lie along a ray [D6] and how complex the geometry along it is (Eq. 4)."""
     def __init__(self, n):
         super().__init__()
         self.n = n
+        self.side = 2 / (n - 1)  # of a voxel
         self.volume = nn.Buffer(torch.zeros(1, 3, n, n, n))  # x slowest
         voxels = grid_index(n, self.volume.device) * (2 / (n - 1)) - 1  # (n^3,3)
         inside = (voxels.norm(dim=1) < 1 + 6 / n).nonzero()[:, 0]  # in the sphere or next to it
@@ -837,7 +839,7 @@ class Background(nn.Module):
 
 
 class Hits(NamedTuple):
-    """What rays meet; every field is indexed by the ray. depth, point and place have no gradient."""
+    """What rays meet. Every field is indexed by the ray; depth, point and place have no gradient."""
     x: Tensor  # (R,S+1,3) samples in the sphere
     geo: Tensor  # (R,S+1,G) inputs of the colour network there
     w: Tensor  # (R,S+1) their weights
@@ -861,7 +863,8 @@ def trace_rays(model, rays, code, jitter):
     opacity = w.sum(1)  # (R,)
     depth = surface_depth(t, sdf.detach(), w.detach())
     point = rays.at(depth[:, None])[:, 0]  # (R,3)
-    # an interval has the mean colour of its ends, so each of them gets half of its weight [D1]
+    # alpha belongs to intervals, colour to samples: a sample gets half the weight of both of its
+    # intervals [D1]
     w = F.avg_pool1d(w, 2, stride=1, padding=1)  # (R,S+1)
 
     bg_color = model.bg_color.expand_as(rays.d)  # (R,3)
@@ -878,8 +881,8 @@ def surface_depth(t, sdf, w):
     (R,S) of the intervals between them. Each interval votes, with its weight, for the place where
     the line through s at its two ends is zero. Where nothing has weight, the last sample counts."""
     start, end = sdf[:, :-1], sdf[:, 1:]
-    steps = start / (start - end).clamp_min(1e-6)  # (R,S) to the zero, in intervals
-    zero = torch.lerp(t[:, :-1], t[:, 1:], steps)
+    fraction = start / (start - end).clamp_min(1e-6)  # (R,S) of the interval, up to the zero
+    zero = torch.lerp(t[:, :-1], t[:, 1:], fraction)
     zero = zero.clamp(t[:, :1], t[:, -1:])
     return ((w * zero).sum(1) + 1e-6 * t[:, -1]) / (w.sum(1) + 1e-6)
 
@@ -913,7 +916,8 @@ def render_rays(model, rays, code, jitter):
 
 # ---- 6 Photos in the wild: transient mask and geometry preservation ------------------------------
 
-# of Eq. 4 (paper), which has lambda_curv in Eq. 5, too; there 2 would outweigh L_rgb [D2]
+# the paper's values for Eq. 4; its Eq. 5 has a lambda_curv, too: with 2, L_curv would outweigh
+# L_rgb [D2]
 LAMBDA_GRAD, LAMBDA_CURV = 10.0, 2.0
 MIN_THRESHOLD = 0.15  # no smaller error makes a pixel transient
 PLACE_CELLS = 32  # along an axis, of the table of errors over contracted space
@@ -930,16 +934,17 @@ def complexity(e_grad, e_curv):
 def edge_indicator(ray_complexity, opacity):
     """Phi (R,), Eq. 4: a calibrated sigmoid of the complexity, times opacity. The paper does not
     say how it is calibrated. Here the complexity is standardised by its mean and deviation over the
-    step's rays, so that Phi tells rays apart at any scale. A ray through air has no edge, hence the
-    opacity. [D2]"""
-    above_mean = ray_complexity - ray_complexity.mean()
-    deviation = ray_complexity.std(correction=0).clamp_min(1e-3)
-    return opacity * torch.sigmoid(above_mean / deviation)
+    foreground of the step's rays, so that Phi tells edges from flat walls at any scale. A ray
+    through air has no edge, hence the opacity. [D2]"""
+    weight = opacity / opacity.sum().clamp_min(1e-6)  # (R,)
+    mean = (weight * ray_complexity).sum()
+    variance = (weight * (ray_complexity - mean) ** 2).sum()
+    return opacity * torch.sigmoid((ray_complexity - mean) / variance.sqrt().clamp_min(1e-3))
 
 
 def paper_phi(ray_complexity):
-    """Phi (R,), Eq. 4 with a plain sigmoid. The complexity is never negative, so Phi is at least
-    0.5 on every ray and protects all alike."""
+    """Phi (R,), Eq. 4 with a plain sigmoid and E_curv = |lap s|. The complexity is never negative,
+    so Phi is at least 0.5 on every ray; as |lap s| is large, it is near 1 on most."""
     return torch.sigmoid(ray_complexity)
 
 
@@ -952,17 +957,18 @@ def gpl_loss(mask, phi):
 def mask_loss(logit, excess):
     """L_reg: binary cross entropy that classifies rays (R,) by their error. A ray whose error
     exceeds its threshold (excess > 0) is trained towards M = 1, any other towards M = 0, weighted
-    by |excess|. The sum over rays is least where M minimises (1 - M) error + M threshold, but that
-    form's gradient vanishes where the sigmoid saturates. L_GPL adds 0.05 Phi M to it: it can raise
-    a threshold by 0.05 at most. [D3]"""
+    by |excess|. For a single ray this is least where (1 - M) error + M threshold is, whose own
+    gradient vanishes where the sigmoid saturates. L_GPL adds 0.05 Phi M, so it raises the threshold
+    by 0.05 at most. [D3]"""
     is_transient = (excess > 0).float()
     return F.binary_cross_entropy_with_logits(logit, is_transient, excess.abs())
 
 
 def paper_mask_loss(mask, error):
-    """L_reg as the paper describes it: the error that M takes out of L_rgb, with penalties for
-    intensity and bimodality. Their form and weights are not printed; these are CR-NeRF's forms. M
-    minimises 0.15 M^2 - M error: it is error / 0.3, and with L_GPL (error - 0.05 Phi) / 0.3."""
+    """L_reg as the paper describes it: -M error for what M takes out of L_rgb (here the error of
+    the worst channel), and penalties for intensity and bimodality in CR-NeRF's forms; the paper
+    prints neither forms nor weights. M minimises it at (error - 0.02) / 0.26. L_GPL subtracts
+    0.05 Phi from the error, so it lowers M by 0.19 at most."""
     return (0.15 * mask**2 + 0.02 * mask * (1 - mask) - mask * error).mean()
 
 
@@ -992,9 +998,9 @@ class UsualErrors(nn.Module):
         return (PLACE_FACTOR * self.quantile[self.cell(place)]).clamp_min(MIN_THRESHOLD)
 
     def update(self, place, error, is_chosen):
-        """Moves the quantiles of places (R,3), given errors (R,), of which those count that are
-        chosen (R,). An error above a quantile pushes it up by its level, one below pushes it down
-        by 1 - level, so that both balance at the quantile (the gradient of the pinball loss)."""
+        """Moves the quantiles of places (R,3), given errors (R,) of rays. Only rays with is_chosen
+        (R,) push. An error above a quantile raises it by PLACE_QUANTILE, one below lowers it by
+        1 - PLACE_QUANTILE: they balance at the quantile (the gradient of the pinball loss)."""
         cell = self.cell(place)
         is_below = error < self.quantile[cell]
         push = torch.where(is_below, PLACE_QUANTILE - 1, PLACE_QUANTILE) * is_chosen
@@ -1070,15 +1076,9 @@ MAX_PULL = 40  # zeta up to which L_sfm and L_off grow stronger
 CACHE_EVERY = 128  # steps between renewals of the cache
 
 
-class Parts(NamedTuple):
-    """What is modelled: no more than a scene needs. [D8]"""
-    levels: int  # of the octree
-    appearance_dim: int  # A, 0: no appearance codes
-    has_background: bool  # or one colour
-
-
 def needed_parts(cfg, raw):
-    """Parts for the scene file `raw`, unless settings say how many, on or off."""
+    """What the scene file `raw` needs, and no more, unless settings say so: the octree's levels;
+    A, 0 without appearance codes; whether the background is a field or one colour. [D8]"""
     def is_on(setting, is_needed):
         return bool(is_needed) if setting == "auto" else setting == "on"
 
@@ -1089,12 +1089,12 @@ def needed_parts(cfg, raw):
     has_codes = is_on(cfg.appearance, raw["exposure_spread"] > 0.01)
     has_no_color = np.isnan(raw["bg_color"]).any()  # nan: the background has no one colour
     has_background = is_on(cfg.background, has_no_color)
-    return Parts(levels, cfg.appearance_dim if has_codes else 0, has_background)
+    return levels, cfg.appearance_dim if has_codes else 0, has_background
 
 
 def objective(loss, cfg):
-    """L, the weighted sum of losses in the paper's order, with one term more, for SfM points [D5].
-    lambda_rgb is 1. Eq. 5"""
+    """L, the weighted sum of losses in the paper's order, with two terms more: the off-surface
+    penalty, which its text names, and one for SfM points [D5]. lambda_rgb is 1. Eq. 5"""
     return (
         loss["rgb"]
         + cfg.lam_eik * loss["eik"]
@@ -1147,7 +1147,7 @@ class GeoNVS(nn.Module):
         self.mask = TransientMask(scene.thumbs)
         self.usual_errors = UsualErrors()
         self.cache = SDFCache(64 if levels < 4 else 128)  # as fine as the octree, within bounds
-        self.cache.refresh(self.distance)
+        self.refresh_cache()
         print(f"  octree levels: {levels}, appearance code: {A}, octrees: {len(self.octrees)}")
 
     @property
@@ -1190,11 +1190,10 @@ class GeoNVS(nn.Module):
         sfm = self.sfm[random_index(gen, len(self.sfm), n)]  # (n,3)
         start, end = self.air[random_index(gen, len(self.air), n)].unbind(1)  # (n,3)
         air = start.lerp(end, uniform(gen, n, 1))  # (n,3)
-        # one lookup is faster than three [D6]
-        points = torch.cat([hits.point, sfm, air])  # (R+2n,3)
+        points = torch.cat([hits.point, sfm, air])  # (R+2n,3), looked up at once [D6]
         s, grad, lap = self.sdf.derivatives(points, self.eps)  # (R+2n,), (R+2n,3), (R+2n,)
         opacity = hits.opacity.detach()
-        is_surface = F.pad(opacity, (0, 2 * n), value=1.0)  # (R+2n,) a ray through air has none
+        eik_weight = F.pad(opacity, (0, 2 * n), value=1.0)  # (R+2n,)
 
         rgb = shade(self, rays, code, hits, F.normalize(grad[:R]))  # (R,3)
         residual = (rgb - rays.rgb).abs()  # (R,3)
@@ -1205,7 +1204,7 @@ class GeoNVS(nn.Module):
         _, s_sfm, s_air = s.split([R, n, n])
         loss = dict(
             rgb=((1 - left_out) * residual.mean(1)).mean(),  # [D3]
-            eik=(is_surface * eikonal(grad)).mean(),
+            eik=(eik_weight * eikonal(grad)).mean(),
             curv=(opacity * lap[:R].abs()).mean() * self.eps,  # [D2]
             reg=reg,
             gpl=gpl,
@@ -1222,15 +1221,15 @@ class GeoNVS(nn.Module):
 
     def phi(self, hits):
         """Phi (R,) of rays with hits. Eq. 4"""
-        ray_complexity = complexity(*self.cache.errors(hits.x))  # (R,)
+        e_grad, e_curv = self.cache.errors(hits.x)  # (R,)
         if self.cfg.printed("phi"):
-            return paper_phi(ray_complexity)
-        return edge_indicator(ray_complexity, hits.opacity.detach())
+            return paper_phi(complexity(e_grad, e_curv / self.cache.side))
+        return edge_indicator(complexity(e_grad, e_curv), hits.opacity.detach())
 
     def transients(self, rays, photos, place, phi, error, done):
-        """Section 6 for rays that end at places (R,3), with Phi and errors (R,). Returns what L_rgb
-        leaves out (R,), which is M, or 1 for rejected outliers and for pixels that a user's mask
-        excludes; L_reg; L_GPL."""
+        """Section 6 for rays that end at places (R,3), with Phi and errors (R,). Returns left_out
+        (R,), L_reg and L_GPL. L_rgb is weighted by 1 - left_out, which is M; it is 1 for rejected
+        outliers and for pixels that a user's mask excludes."""
         left_out = torch.zeros_like(error)
         reg = gpl = error.new_zeros(())
         if self.has_mask:
@@ -1263,9 +1262,9 @@ class GeoNVS(nn.Module):
         octree.cell_error.index_add_(0, node[:, -1], columns)
 
     def before_step(self, step, done):
-        """Keeps zeta within bounds and renews the cache. The floor of zeta rises with training
-        (done: 0..1): while surfaces are soft the model can paint people, so that they have small
-        errors and are not masked, and then surfaces stay soft. The upper bound is a width 1 / zeta
+        """Keeps zeta within bounds and renews the cache. A soft surface can paint people. Painted
+        people have small errors, so the mask misses them, and the surface stays soft. A lower bound
+        that rises with training (done: 0..1) breaks this loop. The upper bound is a width 1 / zeta
         of 1/64 of an even interval, 2 / S; thinner surfaces get no gradient. [D7]"""
         start, end = ZETA_FLOOR
         lower = start + (end - start) * min(done / ZETA_RISE, 1.0)
@@ -1274,10 +1273,10 @@ class GeoNVS(nn.Module):
             lower, upper = 1e-6, 1e6  # no overflow
         self.deviation.data.clamp_(math.log(lower) / 10, math.log(upper) / 10)
         if step % CACHE_EVERY == 0:
-            self.cache.refresh(self.distance)
+            self.refresh_cache()
 
-    def after_training(self):
-        """Pictures follow the last weights."""
+    def refresh_cache(self):
+        """Renews the cache: every CACHE_EVERY steps, and before pictures are made."""
         self.cache.refresh(self.distance)
 
     def batch(self, n, gen):
@@ -1406,8 +1405,8 @@ def fingerprint(raw):
 
 
 def save(run, model, optimizer, gen, state, terms):
-    """Adds a line to the log, replaces checkpoint.pt, which holds the log, too, and log.jsonl, then
-    prints. terms: the step's losses."""
+    """Adds a line to the log, writes checkpoint.pt (with the log in it) and log.jsonl, and prints.
+    terms: the step's losses."""
     line = dict(step=state.step, seconds=state.seconds, joules=state.joules)
     line |= {key: value.item() for key, value in terms.items()}
     line["psnr"] = -10 * math.log10(line["mse"] + 1e-10)  # of the step's rays, people included
@@ -1441,6 +1440,8 @@ def read_checkpoint(path, given):
         data_prep.refuse_bomb(path)
         saved = dict(torch.load(path, map_location="cpu", weights_only=True))
         return saved, Config(**saved["config"] | given)
+    except UserError:
+        raise
     except Exception as error:  # a damaged file fails in any layer: zip, pickle, tensor storage
         raise UserError(f"{path} is damaged, or of another version of geonvs.py ({error!r:.90}): "
                         "use that version, or train under another --name")
@@ -1481,7 +1482,7 @@ def load_run(run, **given):
     with device:
         model = GeoNVS(cfg, scene)
     _, state = restore(saved, model)
-    model.after_training()  # a run that was stopped has an older cache
+    model.refresh_cache()  # a run that was stopped has an older cache
     codes = model.codes()
     if (run / "codes.npy").exists():  # finished: codes of test photos are fitted
         codes = torch.as_tensor(np.load(run / "codes.npy"), device=device)
@@ -1511,10 +1512,10 @@ def train(cfg, scene, run, saved=None, processes=ALONE):
     if saved:  # the first process goes on with its random numbers, the others begin theirs again
         optimizer, state = restore(saved, model, gen if processes.is_first else None)
         if not processes.is_first:
-            model.sdf.octree.cell_error.zero_()  # what the first one has is of all
+            model.sdf.octree.cell_error.zero_()  # saved sums are those of the first process
     done = state.share_done(cfg)
     if done >= 1:
-        model.after_training()
+        model.refresh_cache()
         return model, state
     if saved and processes.is_first:
         for name in RESULTS:  # of the shorter training
@@ -1552,7 +1553,7 @@ def train(cfg, scene, run, saved=None, processes=ALONE):
     if caught or is_stopped:
         raise KeyboardInterrupt(
             f"stopped; step {state.step} is saved, and the same command with --resume goes on")
-    model.after_training()
+    model.refresh_cache()
     return model, state
 
 
@@ -1580,8 +1581,8 @@ def photo_rays(scene, photo):
 
 @torch.no_grad()
 def render_photo(model, scene, photo, code):
-    """A photo's view under an appearance code (A,): its colours, the photo itself, normals as long
-    as the ray's opacity, each (H,W,3), and depth (H,W), along the ray."""
+    """A photo's view under an appearance code (A,): its colours, the photo itself, normals scaled
+    by opacity, each (H,W,3), and depth (H,W), along the ray."""
     w, h = scene.wh[photo].tolist()
     parts = []
     for pixel in torch.arange(w * h, device=code.device).split(RENDER_RAYS[code.device.type]):
@@ -1595,8 +1596,8 @@ def render_photo(model, scene, photo, code):
 
 
 def fit_codes(model, scene, photos, steps=128, n=64):
-    """Appearance codes (B,A) of unseen photos (B,): Adam on n random rays a step of each left half,
-    from the mean code of the training photos. The scene stays as it is."""
+    """Appearance codes (B,A) of unseen photos (B,), by Adam from the mean code of the training
+    photos. Each step uses n random rays of each photo's left half. The scene stays as it is."""
     gen = torch.Generator(photos.device).manual_seed(0)
     codes = model.codes()[scene.train].mean(0).repeat(len(photos), 1)  # (B,A)
     if codes.numel() == 0:
