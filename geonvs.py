@@ -39,7 +39,7 @@ Departures from the printed paper. The tag stands at the code; .github/RESULTS.m
 one is worth.
   tag   in the paper                   here                              because
   [D1]  alpha: a difference of         NeuS's Eq. 13, with s at both     printed, a surface lets 37
-        sigmoids with a slope beta     ends of an interval               % of the light pass
+        sigmoids with a slope beta     ends of an interval               percent of the light pass
   [D2]  E_curv = |lap s|; Phi on       |lap s| times the step; L_eik,    |lap s| grows without bound
         every ray                      L_curv, Phi are weighted by       on fine grids
                                        opacity
@@ -839,7 +839,7 @@ class Background(nn.Module):
 
 
 class Hits(NamedTuple):
-    """What rays meet. Every field is indexed by the ray; depth, point and place have no gradient."""
+    """What rays meet, indexed by the ray. depth, point and place have no gradient."""
     x: Tensor  # (R,S+1,3) samples in the sphere
     geo: Tensor  # (R,S+1,G) inputs of the colour network there
     w: Tensor  # (R,S+1) their weights
