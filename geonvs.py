@@ -178,7 +178,7 @@ GPU_DEFAULTS = dict(steps=75_000, rays=16_384, photos=16, samples=32, appearance
 class Processes:
     """The processes that torchrun started, or this one alone. Each process draws its own rays and
     keeps its own error quantiles (UsualErrors). Gradients are averaged, so all hold the same
-    weights. The first process prints and saves."""
+    weights. The first process decides, prints and saves. Only one process resumes to the bit."""
     count: int = 1
     rank: int = 0
     local_rank: int = 0  # on this machine: the number of the process's GPU
@@ -572,7 +572,7 @@ def cells_to_split(octree):
     is_chosen = error_before < SPLIT_SHARE * error.sum()
     room = max(MAX_CELLS - len(level), 0) // (7 * 8)  # six neighbours are split with each
     if is_chosen.sum() > room:
-        print(f"  the octree is full: {len(level)} cells of {MAX_CELLS}, so it is refined less")
+        print(f"  {len(level)} octree cells near the limit of {MAX_CELLS}: fewer are split")
     return octree.cells[worst[is_chosen][:room]]
 
 
@@ -709,7 +709,7 @@ def neus_alpha(sdf, zeta):
 def paper_alpha(sdf, zeta):
     """Eq. 1 as printed: sigmoid(zeta s_i + beta_i) - sigmoid(zeta s_{i+1} + beta_i), here not
     negative. beta_i, half of the slope times the length of the interval, is half of the change of
-    s. Without NeuS's division the opacities of a crossing sum to 1 at most. Many samples then let
+    s. Without NeuS's division the opacities of a crossing sum to about 1. Many samples then let
     exp(-1) of the light through: 63 % are absorbed."""
     beta = sdf.diff() / 2  # (R,S)
     before = torch.sigmoid(zeta * sdf[:, :-1] + beta)
@@ -879,12 +879,15 @@ def trace_rays(model, rays, code, jitter):
 def surface_depth(t, sdf, w):
     """Distance (R,) to the surface on rays with samples at t (R,S+1), SDF (R,S+1) and weights w
     (R,S) of the intervals between them. Each interval votes, with its weight, for the place where
-    the line through s at its two ends is zero. Where nothing has weight, the last sample counts."""
+    the line through s at its two ends is zero: exact for planes. An interval in which s changes
+    sign has a hundred times the vote, as a curved surface leaves the lines of others. Where nothing
+    has weight, the last sample counts."""
     start, end = sdf[:, :-1], sdf[:, 1:]
     fraction = start / (start - end).clamp_min(1e-6)  # (R,S) of the interval, up to the zero
     zero = torch.lerp(t[:, :-1], t[:, 1:], fraction)
     zero = zero.clamp(t[:, :1], t[:, -1:])
-    return ((w * zero).sum(1) + 1e-6 * t[:, -1]) / (w.sum(1) + 1e-6)
+    w = torch.where((start > 0) & (end <= 0), w, 0.01 * w)
+    return ((w * zero).sum(1) + 1e-8 * t[:, -1]) / (w.sum(1) + 1e-8)
 
 
 def shade(model, rays, code, hits, normal):
@@ -933,13 +936,15 @@ def complexity(e_grad, e_curv):
 
 def edge_indicator(ray_complexity, opacity):
     """Phi (R,), Eq. 4: a calibrated sigmoid of the complexity, times opacity. The paper does not
-    say how it is calibrated. Here the complexity is standardised by its mean and deviation over the
-    foreground of the step's rays, so that Phi tells edges from flat walls at any scale. A ray
-    through air has no edge, hence the opacity. [D2]"""
+    say how it is calibrated. Here the logarithm of the complexity is standardised by its mean and
+    deviation over the foreground of the step's rays, so that Phi tells edges from flat walls at any
+    scale. A ray through air has no edge, hence the opacity (R,), 0 for rays that do not count.
+    [D2]"""
     weight = opacity / opacity.sum().clamp_min(1e-6)  # (R,)
-    mean = (weight * ray_complexity).sum()
-    variance = (weight * (ray_complexity - mean) ** 2).sum()
-    return opacity * torch.sigmoid((ray_complexity - mean) / variance.sqrt().clamp_min(1e-3))
+    x = (ray_complexity + 1e-3).log()
+    mean = (weight * x).sum()
+    variance = (weight * (x - mean) ** 2).sum()
+    return opacity * torch.sigmoid((x - mean) / variance.sqrt().clamp_min(1e-3))
 
 
 def paper_phi(ray_complexity):
@@ -1003,10 +1008,12 @@ class UsualErrors(nn.Module):
         1 - PLACE_QUANTILE: they balance at the quantile (the gradient of the pinball loss)."""
         cell = self.cell(place)
         is_below = error < self.quantile[cell]
-        push = torch.where(is_below, PLACE_QUANTILE - 1, PLACE_QUANTILE) * is_chosen
-        mean = torch.zeros_like(self.quantile)
+        push = torch.where(is_below, PLACE_QUANTILE - 1, PLACE_QUANTILE)
+        count = len(self.quantile)
+        mean = push.new_zeros(count + 1)  # the last one is of rays that do not count
+        cell = torch.where(is_chosen, cell, count)
         mean.scatter_reduce_(0, cell, push, "mean", include_self=False)
-        self.quantile *= torch.exp(QUANTILE_RATE * mean)
+        self.quantile *= torch.exp(QUANTILE_RATE * mean[:count])
         self.quantile.clamp_min_(1e-6)  # as no factor leads away from 0
 
 
@@ -1079,8 +1086,8 @@ CACHE_EVERY = 128  # steps between renewals of the cache
 def needed_parts(cfg, raw):
     """What the scene file `raw` needs, and no more, unless settings say so: the octree's levels;
     A, 0 without appearance codes; whether the background is a field or one colour. [D8]"""
-    def is_on(setting, is_needed):
-        return bool(is_needed) if setting == "auto" else setting == "on"
+    def is_on(switch, is_needed):
+        return bool(is_needed) if switch == "auto" else switch == "on"
 
     levels = cfg.levels
     if levels == 0:
@@ -1198,10 +1205,11 @@ class GeoNVS(nn.Module):
         rgb = shade(self, rays, code, hits, F.normalize(grad[:R]))  # (R,3)
         residual = (rgb - rays.rgb).abs()  # (R,3)
         error = residual.detach().amax(1)  # (R,) of the worst channel
-        phi = self.phi(hits)  # (R,)
+        phi = self.phi(rays, hits)  # (R,)
         left_out, reg, gpl = self.transients(rays, photos, hits.place, phi, error, done)
         pull = self.zeta().detach().clamp_max(MAX_PULL)  # at first s must be free to change [D5]
         _, s_sfm, s_air = s.split([R, n, n])
+        margin = min(self.sdf.octree.finest, AIR_GAP)
         loss = dict(
             rgb=((1 - left_out) * residual.mean(1)).mean(),  # [D3]
             eik=(eik_weight * eikonal(grad)).mean(),
@@ -1209,26 +1217,25 @@ class GeoNVS(nn.Module):
             reg=reg,
             gpl=gpl,
             lps=lipschitz_loss(self.color),
-            off=pull * off_surface_loss(s_air, self.sdf.octree.finest),  # [D5]
+            off=pull * off_surface_loss(s_air, margin),  # [D5]
             sfm=pull * s_sfm.abs().mean())  # [D5]
         self.remember(rays, hits, error)
         log = loss | dict(
             mse=residual.square().mean(),
-            left_out=left_out.mean(),
-            phi_mean=phi.mean(),
-            phi_spread=phi.std(correction=0))
+            left_out=left_out.mean())
         return objective(loss, cfg), log
 
-    def phi(self, hits):
-        """Phi (R,) of rays with hits. Eq. 4"""
+    def phi(self, rays, hits):
+        """Phi (R,) of rays with hits, 0 where a user's mask excludes the pixel. Eq. 4"""
+        is_counted = ~rays.is_masked
         e_grad, e_curv = self.cache.errors(hits.x)  # (R,)
         if self.cfg.printed("phi"):
-            return paper_phi(complexity(e_grad, e_curv / self.cache.side))
-        return edge_indicator(complexity(e_grad, e_curv), hits.opacity.detach())
+            return paper_phi(complexity(e_grad, e_curv / self.cache.side)) * is_counted
+        return edge_indicator(complexity(e_grad, e_curv), hits.opacity.detach() * is_counted)
 
     def transients(self, rays, photos, place, phi, error, done):
         """Section 6 for rays that end at places (R,3), with Phi and errors (R,). Returns left_out
-        (R,), L_reg and L_GPL. L_rgb is weighted by 1 - left_out, which is M; it is 1 for rejected
+        (R,), L_reg and L_GPL. L_rgb is weighted by 1 - left_out. left_out is M, or 1 for rejected
         outliers and for pixels that a user's mask excludes."""
         left_out = torch.zeros_like(error)
         reg = gpl = error.new_zeros(())
@@ -1246,12 +1253,13 @@ class GeoNVS(nn.Module):
                 excess = error - self.usual_errors.threshold(place)
                 reg = mask_loss(logit, excess * is_counted)
                 left_out = reject_outliers(M.detach(), excess > 0, done)
-            gpl = gpl_loss(M, phi * is_counted)
+            gpl = gpl_loss(M, phi)
         return left_out.masked_fill(rays.is_masked, 1), reg, gpl
 
     def remember(self, rays, hits, error):
         """Follows the errors (R,) of a step's rays: for the mask's threshold those of a place, for
-        refinement those of the octree's cells at surface points. [D3] [D8]"""
+        refinement those of the octree's cells at surface points. People's errors count there, too:
+        to leave them out made no difference. [D3] [D8]"""
         self.usual_errors.update(hits.place, error, ~rays.is_masked)
         is_solid = hits.opacity > 0.5  # (R,)
         pixel = hits.depth / self.scene.K[rays.img, 0]  # (R,) its size at the surface point
@@ -1443,6 +1451,8 @@ def read_checkpoint(path, given):
     except UserError:
         raise
     except Exception as error:  # a damaged file fails in any layer: zip, pickle, tensor storage
+        if is_memory_full(error):
+            raise
         raise UserError(f"{path} is damaged, or of another version of geonvs.py ({error!r:.90}): "
                         "use that version, or train under another --name")
 
@@ -1468,6 +1478,8 @@ def restore(saved, model, gen=None):
     except UserError:
         raise
     except Exception as error:
+        if is_memory_full(error):
+            raise
         raise UserError(f"checkpoint.pt does not fit settings or kind of device ({error!r:.90}): "
                         "use those it was made with, or train under another --name")
 
@@ -1504,7 +1516,8 @@ def train(cfg, scene, run, saved=None, processes=ALONE):
           f"{len(scene.test)} held out; {scene.c2w.device}; {run}/")
     torch.set_flush_denormal(True)  # vanishing weights would otherwise slow a CPU down
     torch.manual_seed(cfg.seed)
-    gen = torch.Generator(scene.c2w.device).manual_seed(cfg.seed + processes.rank)
+    own_seed = cfg.seed * processes.count + processes.rank
+    gen = torch.Generator(scene.c2w.device).manual_seed(own_seed)
     with gen.device:
         model = GeoNVS(cfg, scene)
     optimizer = make_optimizer(model)
@@ -1928,8 +1941,10 @@ def main(argv=None):
           "beside it by --name NAME, or delete the folder to replace it")
     check(cfg.rays % cfg.photos == 0,
           f"--rays {cfg.rays} must be a multiple of --photos {cfg.photos}")
-    numbers = dict(WORLD_SIZE=1, RANK=0, LOCAL_RANK=0) | os.environ  # as torchrun says
-    processes = Processes(*[int(numbers[key]) for key in ("WORLD_SIZE", "RANK", "LOCAL_RANK")])
+    processes = ALONE
+    if os.environ.get("WORLD_SIZE", "1") != "1":  # torchrun says so
+        numbers = [os.environ.get(key, 0) for key in ("WORLD_SIZE", "RANK", "LOCAL_RANK")]
+        processes = Processes(*map(int, numbers))
     device = pick_device(cfg.device, processes)
     if processes.count > 1:
         processes.join(device)
