@@ -3325,6 +3325,13 @@ def test_processes_come_from_torchrun(command, monkeypatch):
     assert_refused(command(FLAGS), "torchrun")
 
 
+def test_a_rank_without_others_is_alone(command, monkeypatch):
+    monkeypatch.delenv("WORLD_SIZE", raising=False)
+    monkeypatch.setenv("RANK", "1")
+    assert command(FLAGS) == (0, "")
+    assert Path("runs/b/metrics.json").exists()
+
+
 @pytest.mark.parametrize("name, gpus, device", [
     ("auto", 2, "cuda:1"), ("cpu", 2, "cpu"), ("auto", 0, "cpu")])
 def test_each_process_takes_its_own_gpu(monkeypatch, name, gpus, device):
