@@ -53,8 +53,8 @@ one is worth.
                                        0, and say what is air
   [D6]  derivatives at every sample;   at one surface point per ray, at  each costs five lookups;
         no normal as an input          SfM points and in air; colours    the normal is worth half a
-                                       see the normal; samples and Phi   decibel on photos
-                                       follow a cached SDF
+                                       see the normal; samples and Phi   decibel on two of three
+                                       follow a cached SDF               sets of photos
   [D7]  zeta is learned                within bounds, of which the       else surfaces stay soft and
                                        lower one rises                   people get painted
   [D8]  octrees are pruned             cells split where colours err;    empty cells cost nothing
@@ -644,8 +644,8 @@ def off_surface_loss(sdf, margin):
 
 class SDFField(nn.Module):
     """s(x) and the inputs of the colour network: a geometry feature beside the octree's features.
-    One hidden layer over xyz and features; G = GEOMETRY_FEATURES + L C. The network
-    predicts an offset to the SDF of a small sphere. In float32 on every device."""
+    One hidden layer over xyz and features; G = GEOMETRY_FEATURES + L C. The network predicts an
+    offset to the SDF of a small sphere. In float32 on every device."""
     def __init__(self, octree, hidden):
         super().__init__()
         self.octree = octree
@@ -763,7 +763,7 @@ class SDFCache(nn.Module):
         self.n = n
         self.side = 2 / (n - 1)  # of a voxel
         self.volume = nn.Buffer(torch.zeros(1, 3, n, n, n))  # x slowest
-        voxels = grid_index(n, self.volume.device) * (2 / (n - 1)) - 1  # (n^3,3)
+        voxels = grid_index(n, self.volume.device) * self.side - 1  # (n^3,3)
         inside = (voxels.norm(dim=1) < 1 + 6 / n).nonzero()[:, 0]  # in the sphere or next to it
         self.inside = nn.Buffer(inside, persistent=False)
         self.points = nn.Buffer(voxels[inside], persistent=False)  # (P,3)
@@ -772,7 +772,7 @@ class SDFCache(nn.Module):
         """Evaluates sdf, (P,3) to (P,), again at all voxels in the sphere."""
         s = self.volume[0, 0].flatten()  # (n^3,)
         s[self.inside] = in_chunks(sdf, self.points)
-        s = s.view_as(self.volume[0, 0])
+        s = s.view(self.n, self.n, self.n)
         self.volume[0] = torch.stack([s, *central_differences(s)])
 
     def lookup(self, x, channels):
@@ -900,21 +900,11 @@ def shade(model, rays, code, hits, normal):
 
 
 class Rendering(NamedTuple):
-    """A rendered batch of rays."""
+    """A batch of rays as a picture shows it."""
     rgb: Tensor  # (R,3)
     opacity: Tensor  # (R,) of the foreground
     depth: Tensor  # (R,)
     normal: Tensor  # (R,3) at the surface point, times opacity: 0 where nothing is
-
-
-def render_rays(model, rays, code, jitter):
-    """A batch of rays through the cache, the networks and the background of a model (section 7).
-    Arguments as those of trace_rays."""
-    hits = trace_rays(model, rays, code, jitter)
-    _, grad, _ = model.sdf.derivatives(hits.point, model.eps)
-    normal = F.normalize(grad)
-    rgb = shade(model, rays, code, hits, normal)
-    return Rendering(rgb, hits.opacity, hits.depth, normal * hits.opacity[:, None])
 
 
 # ---- 6 Photos in the wild: transient mask and geometry preservation ------------------------------
@@ -1258,8 +1248,7 @@ class GeoNVS(nn.Module):
 
     def remember(self, rays, hits, error):
         """Follows the errors (R,) of a step's rays: for the mask's threshold those of a place, for
-        refinement those of the octree's cells at surface points. People's errors count there, too:
-        to leave them out made no difference. [D3] [D8]"""
+        refinement those of the octree's cells at surface points, people's among them. [D3] [D8]"""
         self.usual_errors.update(hits.place, error, ~rays.is_masked)
         is_solid = hits.opacity > 0.5  # (R,)
         pixel = hits.depth / self.scene.K[rays.img, 0]  # (R,) its size at the surface point
@@ -1330,9 +1319,14 @@ class GeoNVS(nn.Module):
         return self.appearance.weight.detach()
 
     def render(self, rays, code):
-        """render_rays with samples in the middle of their strata: for pictures, to fit codes."""
+        """Rendering of rays under codes (R,A), with samples in the middle of their strata: for
+        pictures, and to fit codes."""
         middle = code.new_full((len(code), self.jitter_per_ray), 0.5)
-        return render_rays(self, rays, code, middle)
+        hits = trace_rays(self, rays, code, middle)
+        _, grad, _ = self.sdf.derivatives(hits.point, self.eps)
+        normal = F.normalize(grad)
+        rgb = shade(self, rays, code, hits, normal)
+        return Rendering(rgb, hits.opacity, hits.depth, normal * hits.opacity[:, None])
 
 
 # ---- 8 Energy ------------------------------------------------------------------------------------

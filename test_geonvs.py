@@ -1876,7 +1876,7 @@ def plain_derivatives(model, x):
 
 
 def plain_render(model, o, d, t, code, jitter):
-    """What trace_rays and render_rays return for one ray, in one row, sample by sample."""
+    """What trace_rays and shade return for one ray, in one row, sample by sample."""
     zeta = torch.exp(10 * model.deviation)
     samples = [plain_sdf(model, o + distance * d) for distance in t]
     phi = [(zeta * s).sigmoid() for s, _ in samples]
@@ -1907,7 +1907,7 @@ def plain_render(model, o, d, t, code, jitter):
         bg_color, bg_place = plain_background(model, o, d, t[-1], per_ray, jitter)
     rgb = rgb + (1 - opacity) * bg_color
     place = point if opacity > 0.5 else bg_place
-    return torch.hstack([rgb, opacity, depth, opacity * normal, point, place])
+    return torch.hstack([rgb, opacity, depth, normal, point, place])
 
 
 def rough_case(**changes):
@@ -1932,6 +1932,13 @@ def rough_case(**changes):
     return model, rays._replace(d=F.normalize(d)), photos
 
 
+def shaded(model, rays, code, hits):
+    """Colours (R,3) and normals (R,3) of hits."""
+    _, grad, _ = model.sdf.derivatives(hits.point, model.eps)
+    normal = F.normalize(grad)
+    return geonvs.shade(model, rays, code, hits, normal), normal
+
+
 @pytest.mark.parametrize("background", ["on", "off"])
 def test_rendering_and_its_gradients_equal_plain_loops(double, background):
     model, rays, _ = rough_case(background=background)
@@ -1942,8 +1949,8 @@ def test_rendering_and_its_gradients_equal_plain_loops(double, background):
     rows = zip(rays.o, rays.d, t, code, outer)
     wanted = [plain_render(model, *row) for row in rows]
     hits = geonvs.trace_rays(model, rays, code, jitter)
-    out = geonvs.render_rays(model, rays, code, jitter)
-    found = torch.column_stack([*out, hits.point, hits.place])
+    rgb, normal = shaded(model, rays, code, hits)
+    found = torch.column_stack([rgb, hits.opacity, hits.depth, normal, hits.point, hits.place])
     assert_one_function(model, found, torch.stack(wanted))
 
 
@@ -1956,7 +1963,9 @@ def test_a_new_model_shows_a_small_ball(warm, aside, opacity, depth):
     code = warm.codes()[:1].expand(50, -1)
     middle = torch.full((50, warm.jitter_per_ray), 0.5)
     out = warm.render(rays, code)
-    wanted = geonvs.render_rays(warm, rays, code, middle).rgb
+    hits = geonvs.trace_rays(warm, rays, code, middle)
+    wanted, normal = shaded(warm, rays, code, hits)
+    assert_tensors_close(out.normal, normal * hits.opacity[:, None])
     assert_tensors_close(out.opacity, [opacity] * 50, 0.02)
     assert_tensors_close(out.depth, [depth] * 50, 0.02)
     assert_tensors_close(out.rgb, wanted)  # samples lie in the middle of their strata
@@ -2078,7 +2087,7 @@ def plain_losses(model, rays, done):
     air = (1 - part) * air[:, 0] + part * air[:, 1]
     code = model.appearance(rays.img)
     hits = geonvs.trace_rays(model, rays, code, jitter)
-    rgb = geonvs.render_rays(model, rays, code, jitter).rgb
+    rgb, _ = shaded(model, rays, code, hits)
     errors = [sum(plain_errors(model, x) for x in samples) / 6 for samples in hits.x]
     step = 2 / 63 if cfg.printed("phi") else 1  # E_curv is |lap s|, or that times a voxel's side
     complexity = torch.stack([10 * e_grad + 2 * e_curv / step for e_grad, e_curv in errors])
