@@ -1433,28 +1433,33 @@ def save(run, model, optimizer, gen, state, terms):
     print(f"  {done:4.0%}  step {state.step}  psnr {line['psnr']:.2f}", flush=True)
 
 
+@contextlib.contextmanager
+def one_sentence(says, advice):
+    """A UserError for whatever fails with a bad checkpoint: zip, pickle, tensor storage."""
+    try:
+        yield
+    except Exception as error:
+        if isinstance(error, UserError) or is_memory_full(error):
+            raise
+        raise UserError(f"{says} ({error!r:.90}): {advice}, or train under another --name")
+
+
 def read_checkpoint(path, given):
     """A checkpoint's dictionary, of tensors and plain values, never code; and its settings,
     replaced by those given."""
     check(path.exists(), f"{path} does not exist: train first, without --resume or --render, or "
           "name the run by the --scene, --data, --seed, --paper or --name it was made with")
-    try:
+    with one_sentence(f"{path} is damaged, or of another version of geonvs.py", "use that version"):
         data_prep.refuse_bomb(path)
         saved = dict(torch.load(path, map_location="cpu", weights_only=True))
         return saved, Config(**saved["config"] | given)
-    except UserError:
-        raise
-    except Exception as error:  # a damaged file fails in any layer: zip, pickle, tensor storage
-        if is_memory_full(error):
-            raise
-        raise UserError(f"{path} is damaged, or of another version of geonvs.py ({error!r:.90}): "
-                        "use that version, or train under another --name")
 
 
 def restore(saved, model, gen=None):
     """Puts a checkpoint's weights into a model, and its random numbers into gen, if given, of the
     same kind of device. Returns its optimiser and State."""
-    try:
+    with one_sentence("checkpoint.pt does not fit settings or kind of device",
+                      "use those it was made with"):
         before = saved["scene"]
         now = fingerprint(model.scene.raw)
         changed = [name for name in before | now if before.get(name) != now.get(name)]
@@ -1469,13 +1474,6 @@ def restore(saved, model, gen=None):
         if gen:
             gen.set_state(saved["generator"])
         return optimizer, State(**saved["state"])
-    except UserError:
-        raise
-    except Exception as error:
-        if is_memory_full(error):
-            raise
-        raise UserError(f"checkpoint.pt does not fit settings or kind of device ({error!r:.90}): "
-                        "use those it was made with, or train under another --name")
 
 
 def load_run(run, **given):
