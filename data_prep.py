@@ -289,7 +289,7 @@ class Photo:
 
 
 def find_sphere(x, weight, photos, contain):
-    """Centre (3,) and radius of the scene sphere, which becomes the unit sphere [D7].
+    """Centre (3,) and radius of the scene sphere, which becomes the unit sphere [D5].
 
     Centre: geometric median of points x (P,3) by weight. Radius: 1.1 x the distance of
     95 %; if that is a skyline, more than four times the median distance away, only

@@ -11,7 +11,8 @@ follow one ray from its pixel to the loss; the training loop comes after them.
     torchrun --nproc_per_node 4 geonvs.py  on 4 GPUs, each with rays of its own
     python geonvs.py --help                every setting with its meaning and default
 
-The paper's equations, and the forms as printed that `--paper` trains with
+The paper's equations. `--paper` trains with the forms in the last column; the other departures
+below stay, as there the paper leaves a gap.
   Eq. 1  opacity of an interval     neus_alpha                                 paper_alpha
   Eq. 2  compositing weights        composite
   Eq. 3  geometry preservation      gpl_loss
@@ -35,30 +36,28 @@ Conventions
             colour network from geometry, A appearance dims, I photos in all, B of them in a batch,
             Q SfM points, T sightings, m side of a mask, n as the line says, "." any length
 
-Departures from the printed paper. The tag stands at the code; .github/RESULTS.md says what each
-one is worth.
+Departures from the printed paper. The tag stands at the code; .github/RESULTS.md has figures.
   tag   in the paper                   here                              because
   [D1]  alpha: a difference of         NeuS's Eq. 13, with s at both     printed, a surface lets 37
         sigmoids with a slope beta     ends of an interval               percent of the light pass
-  [D2]  E_curv = |lap s|; Phi on       |lap s| times the step; L_eik,    |lap s| grows without bound
-        every ray                      L_curv, Phi are weighted by       on fine grids
-                                       opacity
+  [D2]  E_curv = |lap s|; Phi on       E_curv = |lap s| times the step   it grows on a finer grid;
+        every ray                      it is taken with; L_eik, L_curv,  rays through air have no
+                                       Phi are weighted by opacity       edges
   [D3]  L_reg: intensity and           M classifies rays by their error  printed, M takes skies;
         bimodality of M, which L_rgb   at a place; early outliers are    errors of memorised people
         trains, too                    rejected; M is fixed at 60 %      are small
   [D4]  CGNet                          a block a stage, GroupNorm, a     photos are small, eight in
                                        head at each resolution           a batch
-  [D5]  a sphere loss in a warm-up     SfM points place the sphere,      else the first sphere stays
-                                       seed the octree, pull s and M to  as a lump before a facade
-                                       0, and say what is air
-  [D6]  derivatives at every sample;   at one surface point per ray, at  each costs five lookups;
-        no normal as an input          SfM points and in air; colours    the normal is worth half a
+  [D5]  a sphere loss in a warm-up     SfM points place the sphere and   else part of the first ball
+                                       seed the octree; s and M are 0    stays before a facade
+                                       there; lines of sight are air
+  [D6]  derivatives at every sample;   at one surface point per ray, at  each is five lookups; the
+        no normal as an input          SfM points and in air; colours    normal is worth half a
                                        see the normal; samples and Phi   decibel on two of three
-                                       follow a cached SDF               sets of photos
-  [D7]  zeta is learned                within bounds, of which the       else surfaces stay soft and
-                                       lower one rises                   people get painted
-  [D8]  octrees are pruned             cells split where colours err;    empty cells cost nothing
-                                       what a scene does not need is
+                                       read a cached SDF, so L_GPL       sets of photos
+                                       moves M alone
+  [D7]  octrees are pruned             cells split where colours err;    cells that are never made
+                                       what a scene does not need is     need no pruning
                                        off
 """
 import argparse
@@ -106,7 +105,7 @@ def setting(default, meaning, **limits):
 SCENES = ("toy", *data_prep.SCENES)
 DEVICES = ("auto", "cpu", "cuda")
 SWITCH = ("auto", "on", "off")
-PRINTED = ("alpha", "phi", "reg", "zeta")  # equations that --paper can choose
+PRINTED = ("alpha", "phi", "reg")  # equations that --paper can choose
 GROUPS = dict(  # titles in --help, by the first setting of each group
     scene="what", steps="how long", rays="model", lam_eik="loss weights", lr_grid="learning rates")
 
@@ -223,7 +222,6 @@ ALONE = Processes()
 # when things happen, in shares of training
 REFINE_AT = (0.1, 0.2, 0.3, 0.45, 0.6)  # the octree is refined; later there is no time to fit it
 REJECTION = 0.3  # outliers are rejected until then, while the mask does not know them yet
-ZETA_RISE = 0.43  # surfaces are soft until then: the lower bound of zeta rises
 MASK_TRAINING = 0.6  # M is fixed from then on, as errors of memorised people are small
 
 
@@ -375,7 +373,7 @@ def air_segments(scene):
 
 ROOT = 16  # cells of the coarsest level along an axis
 MAX_CELLS = 8_000_000  # of the foreground: about 1 GB with Adam's moments, more while refining
-SPLIT_SHARE = 0.8  # a refinement splits the worst cells, which hold this share of the error
+SPLIT_SHARE = 0.5  # a refinement splits the worst cells, which hold this share of the error
 
 
 def trilinear_weights(f):
@@ -433,10 +431,10 @@ class Octree(nn.Module):
         |   |   |
         o---o---o
 
-    So the features of a level fade to 0 at the border of what it refines, and are continuous. Where
-    a level has no cell, its features are 0. `cells[n]` is cell n; `child[n]` is the row of its
-    first child, and `corner[n]` holds the feature rows of its eight corners. `corner_key` names the
-    corner of each feature, so that features survive a rebuild."""
+    So the features of a level fade to 0 at the border of what it refines, and of the cube; they are
+    continuous. Where a level has no cell, its features are 0. `cells[n]` is cell n; `child[n]` is
+    the row of its first child, and `corner[n]` holds the feature rows of its eight corners.
+    `corner_key` names the corner of each feature, so that features survive a rebuild."""
     def __init__(self, half, levels, channels=4, root=ROOT):
         super().__init__()
         self.half = half
@@ -456,8 +454,9 @@ class Octree(nn.Module):
 
     def split(self, cells, reach=0):
         """Splits cells (N,4), and those of their neighbours that differ along at most `reach` axes:
-        1 means the six that share a face, 3 all 26. Cells of the last level are not split. Returns
-        what build does. The function stays as it is, because new features are zero."""
+        1 means the six that share a face, 3 all 26. Cells of the last level are not split, nor
+        neighbours that do not exist (an index of -1 has no cell's key). Returns what build does.
+        The function stays as it is, because new features are zero."""
         offsets = grid_index(3, cells.device) - 1  # (27,3)
         offsets = offsets[offsets.abs().sum(1) <= reach]
         cells = (cells[:, None] + F.pad(offsets, (1, 0))).flatten(0, 1)
@@ -490,6 +489,7 @@ class Octree(nn.Module):
         key = key[has_feature]  # (V,)
         is_old = torch.isin(key, self.corner_key)
 
+        # a checkpoint holds cell_error alone: the other buffers follow from split_keys
         self.split_keys = nn.Buffer(split_keys, persistent=False)
         self.corner_key = nn.Buffer(key, persistent=False)  # (V,) sorted, the corner of each row
         self.features = nn.Parameter(carry_over_rows(self.features, is_old))
@@ -562,7 +562,7 @@ def seed_octree(octree, points, dense):
 def cells_to_split(octree):
     """Cells (N,4) to split: those with the largest summed errors, until they hold SPLIT_SHARE of
     it. Only cells whose children would be larger than a pixel count. Errors are recorded in cells
-    that are not split. [D8]"""
+    that are not split. [D7]"""
     level = octree.cells[:, 0]  # (N,)
     error, pixel, count = octree.cell_error.T  # (N,) sums over rays
     is_coarse = pixel < count * octree.side[level] / 2  # mean size of a pixel under a child's side
@@ -738,20 +738,22 @@ def inverse_cdf(edges, weight, u):
     return edges.gather(1, left).lerp(edges.gather(1, right), part.clamp(0, 1))
 
 
-def stratified(jitter):
-    """One number in each of S equal strata of 0..1: (k + jitter_k) / S, of jitter (R,S)."""
-    _, S = jitter.shape
-    return (torch.arange(S, device=jitter.device) + jitter) / S
+def stratified(rays, n, gen=None):
+    """Numbers (R,n) for rays: one in each of n equal strata of 0..1, at a random place, or in the
+    middle without a generator."""
+    R = len(rays.near)
+    place = torch.full_like(rays.near, 0.5) if gen is None else uniform(gen, R, n)
+    return (torch.arange(n, device=place.device) + place) / n
 
 
-def importance_samples(probes, alpha, jitter):
-    """Distances (R,S+1) from the first to the last of the probes (R,K+1), dense where the intervals
-    between them, of opacity alpha (R,K), have weight. jitter: (R,S-1) in 0..1, of the stratified
-    samples between the two ends."""
+def importance_samples(probes, alpha, u):
+    """Distances (R,S+1): the first and the last of the probes (R,K+1), and between them those of
+    the stratified numbers u (R,S-1). They are dense where the intervals between probes, of opacity
+    alpha (R,K), have weight."""
     weight = composite(alpha)
     uniform_weight = UNIFORM_SHARE * weight.mean(1, keepdim=True)
     weight = weight + uniform_weight + 1e-5  # an empty ray has uniform samples
-    inner = inverse_cdf(probes, weight, stratified(jitter))
+    inner = inverse_cdf(probes, weight, u)
     return torch.cat([probes[:, :1], inner, probes[:, -1:]], 1)
 
 
@@ -764,7 +766,8 @@ class SDFCache(nn.Module):
         self.side = 2 / (n - 1)  # of a voxel
         self.volume = nn.Buffer(torch.zeros(1, 3, n, n, n))  # x slowest
         voxels = grid_index(n, self.volume.device) * self.side - 1  # (n^3,3)
-        inside = (voxels.norm(dim=1) < 1 + 6 / n).nonzero()[:, 0]  # in the sphere or next to it
+        # a little more than the sphere: lookups read one voxel further, second differences two
+        inside = (voxels.norm(dim=1) < 1 + 3 * self.side).nonzero()[:, 0]
         self.inside = nn.Buffer(inside, persistent=False)
         self.points = nn.Buffer(voxels[inside], persistent=False)  # (P,3)
 
@@ -792,7 +795,8 @@ class SDFCache(nn.Module):
 
 def central_differences(s):
     """E_grad and E_curv (n,n,n) of a field s (n,n,n) over [-1, 1]^3. E_curv = |lap s| h, h being
-    the side of a voxel. [D2]"""
+    the side of a voxel: at an edge the slope changes by about 1 within a step h, so |lap s| is
+    about 1 / h, whereas |lap s| h does not depend on the grid. [D2]"""
     h = 2 / (len(s) - 1)
     slopes = torch.gradient(s, spacing=h)  # along x, y, z
     lap = 0
@@ -811,19 +815,19 @@ def contract(x):
 
 class Background(nn.Module):
     """A small NeRF beyond the sphere, on an octree over contracted space."""
-    def __init__(self, points, hidden, extra, levels):
+    def __init__(self, points, hidden, extra, levels, samples):
         super().__init__()
+        self.samples = samples
         self.octree = Octree(2.0, levels, root=32)  # cells of 1/8
         seed_octree(self.octree, contract(points), dense=levels - 3)  # points (P,3)
         self.density = mlp(3 + self.octree.width, hidden, 1 + GEOMETRY_FEATURES)
         self.color = mlp(GEOMETRY_FEATURES + extra, hidden, 3)
 
-    def forward(self, rays, t1, per_ray, jitter):
+    def forward(self, rays, t1, per_ray, gen=None):
         """Colour (R,3) beyond t1 (R,1), and the mean position (R,3) of what is seen there, in
-        contracted space, without gradient. per_ray: (R,3+A) direction and code. A sample, with
-        jitter (R,S) in 0..1, lies u / (1 - u) behind t1, where u is stratified. The last one is
-        opaque."""
-        u = stratified(jitter)
+        contracted space, without gradient. per_ray: (R,3+A) direction and code. A sample lies
+        u / (1 - u) behind t1, where u is stratified. The last one is opaque."""
+        u = stratified(rays, self.samples, gen)  # (R,S)
         distance = u / (1 - u).clamp_min(1e-3)  # (R,S) at most 1,000 radii
         x = contract(rays.at(t1 + distance))  # (R,S,3)
         inputs = torch.cat([x, self.octree(x)], 2)  # (R,S,3+LC)
@@ -851,27 +855,26 @@ class Hits(NamedTuple):
     # foreground is solid, else the mean position of the background
 
 
-def trace_rays(model, rays, code, jitter):
-    """Hits of a batch of rays. code: (R,A) appearance; jitter: (R,.) in 0..1, places samples: S - 1
-    of the foreground, then the background's."""
-    fg_jitter, bg_jitter = jitter.tensor_split([model.cfg.samples - 1], 1)
+def trace_rays(model, rays, code, gen=None):
+    """Hits of a batch of rays under appearance codes (R,A). Samples lie at random places of their
+    strata, or in the middle without a generator."""
     t0, t1 = sphere_interval(rays.o, rays.d, rays.near)  # (R,1)
-    t = model.sample(rays, t0, t1, fg_jitter)  # (R,S+1)
+    t = model.sample(rays, t0, t1, gen)  # (R,S+1)
     x = rays.at(t)  # (R,S+1,3)
     sdf, geo = model.sdf(x)  # (R,S+1), (R,S+1,G)
-    w = composite(model.alpha(sdf))  # (R,S)
-    opacity = w.sum(1)  # (R,)
-    depth = surface_depth(t, sdf.detach(), w.detach())
+    interval_w = composite(model.alpha(sdf))  # (R,S)
+    opacity = interval_w.sum(1)  # (R,)
+    depth = surface_depth(t, sdf.detach(), interval_w.detach())
     point = rays.at(depth[:, None])[:, 0]  # (R,3)
-    # alpha belongs to intervals, colour to samples: a sample gets half the weight of both of its
-    # intervals [D1]
-    w = F.avg_pool1d(w, 2, stride=1, padding=1)  # (R,S+1)
+    # alpha belongs to intervals, colour to samples: an interval gives half of its weight to the
+    # sample at either end [D1]
+    w = F.avg_pool1d(interval_w, 2, stride=1, padding=1)  # (R,S+1)
 
     bg_color = model.bg_color.expand_as(rays.d)  # (R,3)
     bg_place = 2 * rays.d  # (R,3) infinity
     if model.background:
         per_ray = torch.cat([rays.d, code], 1)  # (R,3+A)
-        bg_color, bg_place = model.background(rays, t1, per_ray, bg_jitter)
+        bg_color, bg_place = model.background(rays, t1, per_ray, gen)
     place = torch.where(opacity[:, None] > 0.5, point, bg_place)
     return Hits(x, geo, w, opacity, depth, point, bg_color, place)
 
@@ -879,9 +882,9 @@ def trace_rays(model, rays, code, jitter):
 def surface_depth(t, sdf, w):
     """Distance (R,) to the surface on rays with samples at t (R,S+1), SDF (R,S+1) and weights w
     (R,S) of the intervals between them. Each interval votes, with its weight, for the place where
-    the line through s at its two ends is zero: exact for planes. An interval in which s changes
-    sign has a hundred times the vote, as a curved surface leaves the lines of others. Where nothing
-    has weight, the last sample counts."""
+    the line through s at its two ends is zero: exact for planes. On a curved surface the lines of
+    other intervals miss the zero. So an interval in which s changes sign has a hundred times their
+    vote. Where nothing has weight, the last sample counts."""
     start, end = sdf[:, :-1], sdf[:, 1:]
     fraction = start / (start - end).clamp_min(1e-6)  # (R,S) of the interval, up to the zero
     zero = torch.lerp(t[:, :-1], t[:, 1:], fraction)
@@ -909,14 +912,14 @@ class Rendering(NamedTuple):
 
 # ---- 6 Photos in the wild: transient mask and geometry preservation ------------------------------
 
-# the paper's values for Eq. 4; its Eq. 5 has a lambda_curv, too: with 2, L_curv would outweigh
-# L_rgb [D2]
+# the paper's values for Eq. 4. Its Eq. 5 has a weight of the same name, here lam_curv: with a value
+# of 2, L_curv would outweigh L_rgb [D2]
 LAMBDA_GRAD, LAMBDA_CURV = 10.0, 2.0
 MIN_THRESHOLD = 0.15  # no smaller error makes a pixel transient
 PLACE_CELLS = 32  # along an axis, of the table of errors over contracted space
 PLACE_QUANTILE = 0.2  # of the errors at a place in all photos; low, so that people hardly raise it
 PLACE_FACTOR = 1.5  # an error up to so many times that quantile is usual for the place
-QUANTILE_RATE = 0.1  # the most by which a running quantile's logarithm moves in a step
+QUANTILE_RATE = 0.1  # of a running quantile's logarithm, in a step
 
 
 def complexity(e_grad, e_curv):
@@ -953,8 +956,9 @@ def mask_loss(logit, excess):
     """L_reg: binary cross entropy that classifies rays (R,) by their error. A ray whose error
     exceeds its threshold (excess > 0) is trained towards M = 1, any other towards M = 0, weighted
     by |excess|. For a single ray this is least where (1 - M) error + M threshold is, whose own
-    gradient vanishes where the sigmoid saturates. L_GPL adds 0.05 Phi M, so it raises the threshold
-    by 0.05 at most. [D3]"""
+    gradient vanishes where the sigmoid saturates. With L_GPL the least is at M = min(1, excess /
+    (0.05 Phi)): edges of the geometry are masked fully only if their errors exceed the threshold
+    by 0.05 and more. [D3]"""
     is_transient = (excess > 0).float()
     return F.binary_cross_entropy_with_logits(logit, is_transient, excess.abs())
 
@@ -969,8 +973,9 @@ def paper_mask_loss(mask, error):
 
 def reject_outliers(mask, is_outlier, done):
     """M (R,) with outliers, rays whose error exceeds the threshold, set to 1 where M exceeds a
-    bar. It rises from 0 to 1 over the first REJECTION of training; then nothing is rejected.
-    Early the scene must not learn people, later it must learn its own details. [D3]"""
+    bar. The bar rises from 0 to 1 over the first REJECTION of training; then nothing is rejected.
+    So at first the scene learns from the rays below their thresholds alone. These grow where all
+    rays err. Later the scene must learn its own details. [D3]"""
     bar = (done / REJECTION) ** 2
     return torch.where(is_outlier & (mask > bar), 1.0, mask)
 
@@ -994,8 +999,9 @@ class UsualErrors(nn.Module):
 
     def update(self, place, error, is_chosen):
         """Moves the quantiles of places (R,3), given errors (R,) of rays. Only rays with is_chosen
-        (R,) push. An error above a quantile raises it by PLACE_QUANTILE, one below lowers it by
-        1 - PLACE_QUANTILE: they balance at the quantile (the gradient of the pinball loss)."""
+        (R,) push. An error above a quantile pushes it up by PLACE_QUANTILE, one below pushes it
+        down by 1 - PLACE_QUANTILE: they balance at the quantile (the pinball loss's gradient). A
+        step multiplies the quantile by exp(QUANTILE_RATE times the mean push)."""
         cell = self.cell(place)
         is_below = error < self.quantile[cell]
         push = torch.where(is_below, PLACE_QUANTILE - 1, PLACE_QUANTILE)
@@ -1067,15 +1073,14 @@ class TransientMask(nn.Module):
 
 # ---- 7 The model and its objective ---------------------------------------------------------------
 
-START_ZETA = 20
-ZETA_FLOOR = 15, 80  # lower bound of zeta at first, and from ZETA_RISE of training on [D7]
+START_ZETA = 20  # a surface is 1/20 of a radius wide
 MAX_PULL = 40  # zeta up to which L_sfm and L_off grow stronger
 CACHE_EVERY = 128  # steps between renewals of the cache
 
 
 def needed_parts(cfg, raw):
     """What the scene file `raw` needs, and no more, unless settings say so: the octree's levels;
-    A, 0 without appearance codes; whether the background is a field or one colour. [D8]"""
+    A, 0 without appearance codes; whether the background is a field or one colour. [D7]"""
     def is_on(switch, is_needed):
         return bool(is_needed) if switch == "auto" else switch == "on"
 
@@ -1113,11 +1118,11 @@ class GeoNVS(nn.Module):
         self.cfg = replace(cfg)
         self.scene = scene
         self.has_mask = cfg.mask == "on"
-        self.jitter_per_ray = cfg.samples - 1 + cfg.bg_samples  # they place a ray's samples
         levels, A, has_background = needed_parts(cfg, scene.raw)
         is_inside = scene.points.norm(dim=1) < 1
         self.sfm = nn.Buffer(scene.points[is_inside], persistent=False)  # (Q,3), never empty
-        self.air = nn.Buffer(air_segments(scene), persistent=False)  # (T,2,3), never empty
+        self.air = nn.Buffer(air_segments(scene), persistent=False)  # (T,2,3)
+        check(len(self.air), "no camera sees an SfM point through air: correct the poses")
 
         octree = Octree(1.0, levels)
         seed_octree(octree, self.sfm, dense=0)
@@ -1138,7 +1143,8 @@ class GeoNVS(nn.Module):
         self.bg_color = nn.Buffer(bg_color, persistent=False)
         if has_background:
             bg_levels = min(levels, 4)  # at most 256 cells across
-            self.background = Background(scene.points[~is_inside], cfg.hidden, 3 + A, bg_levels)
+            self.background = Background(
+                scene.points[~is_inside], cfg.hidden, 3 + A, bg_levels, cfg.bg_samples)
             self.octrees.append(self.background.octree)
         self.deviation = nn.Parameter(torch.tensor(math.log(START_ZETA) / 10))
         self.mask = TransientMask(scene.thumbs)
@@ -1153,27 +1159,27 @@ class GeoNVS(nn.Module):
         return self.sdf.octree.finest / 2
 
     def zeta(self):
-        """The deviation network: one learned number v, zeta = exp(10 v) as in NeuS's code; 1 / zeta
-        is the width of a surface."""
-        return torch.exp(10 * self.deviation)
+        """The deviation network: one learned number v, zeta = exp(10 v), clipped as in NeuS's code;
+        1 / zeta is the width of a surface."""
+        return torch.exp(10 * self.deviation).clamp(1e-6, 1e6)
 
     def alpha(self, sdf, max_zeta=math.inf):
         """Opacity (R,S) of the intervals between samples with SDF (R,S+1). Eq. 1"""
         form = paper_alpha if self.cfg.printed("alpha") else neus_alpha
         return form(sdf, self.zeta().clamp_max(max_zeta))
 
-    def distance(self, x):
+    def signed_distance(self, x):
         """s (P,) at x (P,3)."""
         return self.sdf(x)[0]
 
     @torch.no_grad()
-    def sample(self, rays, t0, t1, jitter):
+    def sample(self, rays, t0, t1, gen=None):
         """Distances (R,S+1) of the samples between t0 and t1 (R,1), dense where the cache sees a
-        surface, which is taken to be at least half a voxel wide. jitter: (R,S-1)"""
+        surface, which is taken to be at least half a voxel wide."""
         even = torch.linspace(0, 1, PROBES + 1, device=t0.device)
         probes = t0.lerp(t1, even)  # (R,PROBES+1)
         alpha = self.alpha(self.cache.sdf(rays.at(probes)), max_zeta=self.cache.n)
-        return importance_samples(probes, alpha, jitter)
+        return importance_samples(probes, alpha, stratified(rays, self.cfg.samples - 1, gen))
 
     def losses(self, rays, photos, done, gen):
         """The objective of rays that come photo by photo, equally many of each of photos (B,);
@@ -1182,7 +1188,7 @@ class GeoNVS(nn.Module):
         cfg = self.cfg
         R = len(rays.o)
         code = self.appearance(photos).repeat_interleave(R // len(photos), 0)  # (R,A)
-        hits = trace_rays(self, rays, code, uniform(gen, R, self.jitter_per_ray))
+        hits = trace_rays(self, rays, code, gen)
         n = math.ceil(R / 4)
         sfm = self.sfm[random_index(gen, len(self.sfm), n)]  # (n,3)
         start, end = self.air[random_index(gen, len(self.air), n)].unbind(1)  # (n,3)
@@ -1190,7 +1196,7 @@ class GeoNVS(nn.Module):
         points = torch.cat([hits.point, sfm, air])  # (R+2n,3), looked up at once [D6]
         s, grad, lap = self.sdf.derivatives(points, self.eps)  # (R+2n,), (R+2n,3), (R+2n,)
         opacity = hits.opacity.detach()
-        eik_weight = F.pad(opacity, (0, 2 * n), value=1.0)  # (R+2n,)
+        eik_weight = torch.cat([opacity, opacity.new_ones(2 * n)])  # (R+2n,)
 
         rgb = shade(self, rays, code, hits, F.normalize(grad[:R]))  # (R,3)
         residual = (rgb - rays.rgb).abs()  # (R,3)
@@ -1248,7 +1254,7 @@ class GeoNVS(nn.Module):
 
     def remember(self, rays, hits, error):
         """Follows the errors (R,) of a step's rays: for the mask's threshold those of a place, for
-        refinement those of the octree's cells at surface points, people's among them. [D3] [D8]"""
+        refinement those of the octree's cells at surface points, people's among them. [D3] [D7]"""
         self.usual_errors.update(hits.place, error, ~rays.is_masked)
         is_solid = hits.opacity > 0.5  # (R,)
         pixel = hits.depth / self.scene.K[rays.img, 0]  # (R,) its size at the surface point
@@ -1258,23 +1264,9 @@ class GeoNVS(nn.Module):
         node, _, _ = octree.locate(hits.point)
         octree.cell_error.index_add_(0, node[:, -1], columns)
 
-    def before_step(self, step, done):
-        """Keeps zeta within bounds and renews the cache. A soft surface can paint people. Painted
-        people have small errors, so the mask misses them, and the surface stays soft. A lower bound
-        that rises with training (done: 0..1) breaks this loop. The upper bound is a width 1 / zeta
-        of 1/64 of an even interval, 2 / S; thinner surfaces get no gradient. [D7]"""
-        start, end = ZETA_FLOOR
-        lower = start + (end - start) * min(done / ZETA_RISE, 1.0)
-        upper = 32 * self.cfg.samples
-        if self.cfg.printed("zeta"):
-            lower, upper = 1e-6, 1e6  # no overflow
-        self.deviation.data.clamp_(math.log(lower) / 10, math.log(upper) / 10)
-        if step % CACHE_EVERY == 0:
-            self.refresh_cache()
-
     def refresh_cache(self):
         """Renews the cache: every CACHE_EVERY steps, and before pictures are made."""
-        self.cache.refresh(self.distance)
+        self.cache.refresh(self.signed_distance)
 
     def batch(self, n, gen):
         """n random rays and the photos (B,) they come from, photo by photo."""
@@ -1300,7 +1292,7 @@ class GeoNVS(nn.Module):
     def refine(self, optimizer, processes=ALONE):
         """Splits cells where colours err, and the neighbours that share a face with them, as the
         outer corners of a single layer of cells would hang. Adam's moments move along with their
-        features. [D8]"""
+        features. [D7]"""
         octree = self.sdf.octree
         processes.sum(octree.cell_error)
         # sums of floats differ between GPUs: one process chooses the cells for all
@@ -1319,10 +1311,8 @@ class GeoNVS(nn.Module):
         return self.appearance.weight.detach()
 
     def render(self, rays, code):
-        """Rendering of rays under codes (R,A), with samples in the middle of their strata: for
-        pictures, and to fit codes."""
-        middle = code.new_full((len(code), self.jitter_per_ray), 0.5)
-        hits = trace_rays(self, rays, code, middle)
+        """Rendering of rays under codes (R,A): for pictures, and to fit codes."""
+        hits = trace_rays(self, rays, code)
         _, grad, _ = self.sdf.derivatives(hits.point, self.eps)
         normal = F.normalize(grad)
         rgb = shade(self, rays, code, hits, normal)
@@ -1381,7 +1371,8 @@ def training_step(model, optimizer, step, done, gen, processes=ALONE):
     """One update; the learning rate rises for 20 steps, then follows a cosine down to 5 %. done:
     share of training, 0..1. Returns the log of GeoNVS.losses and the total. Never waits for the
     device."""
-    model.before_step(step, done)
+    if step % CACHE_EVERY == 0:
+        model.refresh_cache()
     rays, picked = model.batch(model.cfg.rays, gen)
     loss, terms = model.losses(rays, picked, done, gen)
     optimizer.zero_grad()
@@ -1679,7 +1670,7 @@ def toy_truth(model, scene):
     """Errors of surface and mask that only a toy can tell: see data_prep.toy_truth."""
     near, wall = [torch.as_tensor(scene.raw[key]).to(scene.c2w) for key in ("near_wall", "wall")]
     _, gradient, _ = model.sdf.derivatives(wall, 0.004)
-    sdf = model.distance(near)
+    sdf = model.signed_distance(near)
     M = None
     if model.has_mask:
         logits = [
@@ -1699,8 +1690,8 @@ def extract_mesh(model):
     volume = F.interpolate(s, n + 1, mode="trilinear", align_corners=True)[0, 0]
     square = torch.linspace(-1, 1, n + 1, device=volume.device) ** 2
     square = square[:, None, None] + square[:, None] + square  # (n+1,n+1,n+1) squared radius
-    is_close = (square < 1.1) & (volume.abs() < 6 / cache.n)
-    volume[is_close] = in_chunks(model.distance, is_close.nonzero() * (2 / n) - 1)
+    is_close = (square < 1.1) & (volume.abs() < 3 * cache.side)
+    volume[is_close] = in_chunks(model.signed_distance, is_close.nonzero() * (2 / n) - 1)
     volume = volume.cpu().numpy()
     is_inside = (square < 1).cpu().numpy()
     if len(np.unique(volume[is_inside] < 0)) < 2:
