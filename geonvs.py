@@ -11,8 +11,8 @@ follow one ray from its pixel to the loss; the training loop comes after them.
     torchrun --nproc_per_node 4 geonvs.py  on 4 GPUs, each with rays of its own
     python geonvs.py --help                every setting with its meaning and default
 
-The paper's equations. `--paper` trains with the forms in the last column; the other departures
-below stay, as there the paper leaves a gap.
+The paper's equations. `--paper` trains with the forms in the last column; all other departures
+stay.
   Eq. 1  opacity of an interval     neus_alpha                                 paper_alpha
   Eq. 2  compositing weights        composite
   Eq. 3  geometry preservation      gpl_loss
@@ -34,14 +34,14 @@ Conventions
   shapes    R rays, S intervals of a ray (S + 1 samples), K intervals or points on a ray, P points,
             N octree cells, L octree levels, C channels per level, V feature rows, G inputs of the
             colour network from geometry, A appearance dims, I photos in all, B of them in a batch,
-            Q SfM points, T sightings, m side of a mask, n as the line says, "." any length
+            Q SfM points, T sightings, m side of a mask, n: see the line, "." any length
 
 Departures from the printed paper. The tag stands at the code; .github/RESULTS.md has figures.
   tag   in the paper                   here                              because
   [D1]  alpha: a difference of         NeuS's Eq. 13, with s at both     printed, a surface lets 37
         sigmoids with a slope beta     ends of an interval               percent of the light pass
-  [D2]  E_curv = |lap s|; Phi on       E_curv = |lap s| times the step   it grows on a finer grid;
-        every ray                      it is taken with; L_eik, L_curv,  rays through air have no
+  [D2]  E_curv = |lap s|; Phi on       |lap s| h, h being the step of    |lap s| grows as h shrinks;
+        every ray                      the difference; L_eik, L_curv,    rays through air have no
                                        Phi are weighted by opacity       edges
   [D3]  L_reg: intensity and           M classifies rays by their error  printed, M takes skies;
         bimodality of M, which L_rgb   at a place; early outliers are    errors of memorised people
@@ -177,7 +177,8 @@ GPU_DEFAULTS = dict(steps=75_000, rays=16_384, photos=16, samples=32, appearance
 class Processes:
     """The processes that torchrun started, or this one alone. Each process draws its own rays and
     keeps its own error quantiles (UsualErrors). Gradients are averaged, so all hold the same
-    weights. The first process decides, prints and saves. Only one process resumes to the bit."""
+    weights. The first process decides, prints and saves. A run of one process resumes bit for
+    bit, a run of several does not."""
     count: int = 1
     rank: int = 0
     local_rank: int = 0  # on this machine: the number of the process's GPU
@@ -262,10 +263,8 @@ def load_scene(raw, device="cpu"):
     arrays += [np.moveaxis(thumbs, 3, 1), sfm_pixels]
     is_test = raw["is_test"]
     arrays += [np.flatnonzero(~is_test), np.flatnonzero(is_test)]
-    tensors = []
-    for array in arrays:
-        tensor = torch.as_tensor(array, device=device)
-        tensors.append(tensor.float() if tensor.is_floating_point() else tensor)
+    tensors = [torch.as_tensor(array, device=device) for array in arrays]
+    tensors = [x.float() if x.is_floating_point() else x for x in tensors]
     return Scene(*tensors, raw, json.loads(str(raw["info"])))
 
 
@@ -548,9 +547,8 @@ def in_chunks(function, x):
 
 
 def seed_octree(octree, points, dense):
-    """Splits every cell of the first `dense` levels; then twice, if there are as many levels, the
-    cell of each point of points (P,3) and its 26 neighbours, so that no corner of that cell is
-    hanging. Features are then drawn at random. [D5]"""
+    """Splits the first `dense` levels. Then twice splits the finest cell at each of points (P,3)
+    and its 26 neighbours, so that none of its corners hangs. Features are then random. [D5]"""
     for _ in range(dense):
         octree.split(octree.cells)
     for _ in range(2):
@@ -614,12 +612,8 @@ def colors_of(network, geo, per_ray):
     return mixed_precision(network, inputs).sigmoid()
 
 
-TETRAHEDRON = (  # its centre and its corners, at a distance of 3^0.5
-    (0.0, 0.0, 0.0),
-    (1.0, 1.0, 1.0),
-    (1.0, -1.0, -1.0),
-    (-1.0, 1.0, -1.0),
-    (-1.0, -1.0, 1.0))
+# its centre and its corners, at a distance of 3^0.5
+TETRAHEDRON = ((0, 0, 0), (1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1))
 
 
 def finite_differences(s, taps, eps):
@@ -688,7 +682,8 @@ class LipschitzLinear(nn.Linear):
 
 def lipschitz_loss(network):
     """L_lps: the network's Lipschitz bound, the product of its layers' (Liu et al. 2022)."""
-    return math.prod(layer.bound() for layer in network[::2])
+    return math.prod(
+        layer.bound() for layer in network if isinstance(layer, LipschitzLinear))
 
 
 # ---- 5 From SDF to colour: alpha, compositing, samples, background -------------------------------
@@ -739,10 +734,9 @@ def inverse_cdf(edges, weight, u):
 
 
 def stratified(rays, n, gen=None):
-    """Numbers (R,n) for rays: one in each of n equal strata of 0..1, at a random place, or in the
+    """Numbers (R,n) for R rays: one in each of n equal strata of 0..1, at a random place, or in the
     middle without a generator."""
-    R = len(rays.near)
-    place = torch.full_like(rays.near, 0.5) if gen is None else uniform(gen, R, n)
+    place = torch.full_like(rays.near, 0.5) if gen is None else uniform(gen, len(rays.near), n)
     return (torch.arange(n, device=place.device) + place) / n
 
 
@@ -799,10 +793,7 @@ def central_differences(s):
     about 1 / h, whereas |lap s| h does not depend on the grid. [D2]"""
     h = 2 / (len(s) - 1)
     slopes = torch.gradient(s, spacing=h)  # along x, y, z
-    lap = 0
-    for axis, slope in enumerate(slopes):
-        (second,) = torch.gradient(slope, spacing=h, dim=axis)
-        lap = lap + second
+    lap = sum(torch.gradient(slope, spacing=h, dim=i)[0] for i, slope in enumerate(slopes))
     grad = torch.stack(slopes, -1).flatten(0, 2)  # (n^3,3)
     return eikonal(grad).view_as(s), lap.abs() * h
 
@@ -851,8 +842,9 @@ class Hits(NamedTuple):
     depth: Tensor  # (R,) distance to the surface; t1 if none is met
     point: Tensor  # (R,3) the surface point
     bg_color: Tensor  # (R,3) of what lies beyond the sphere
-    place: Tensor  # (R,3) where the ray ends, in contracted space: the surface point if the
-    # foreground is solid, else the mean position of the background
+    # (R,3) where the ray ends, in contracted space: the surface point if the foreground is solid,
+    # else the mean position of the background
+    place: Tensor
 
 
 def trace_rays(model, rays, code, gen=None):
@@ -883,8 +875,8 @@ def surface_depth(t, sdf, w):
     """Distance (R,) to the surface on rays with samples at t (R,S+1), SDF (R,S+1) and weights w
     (R,S) of the intervals between them. Each interval votes, with its weight, for the place where
     the line through s at its two ends is zero: exact for planes. On a curved surface the lines of
-    other intervals miss the zero. So an interval in which s changes sign has a hundred times their
-    vote. Where nothing has weight, the last sample counts."""
+    other intervals miss the zero. So those in which s does not change its sign have a hundredth of
+    the vote. Where nothing has weight, the last sample counts."""
     start, end = sdf[:, :-1], sdf[:, 1:]
     fraction = start / (start - end).clamp_min(1e-6)  # (R,S) of the interval, up to the zero
     zero = torch.lerp(t[:, :-1], t[:, 1:], fraction)
@@ -919,7 +911,7 @@ MIN_THRESHOLD = 0.15  # no smaller error makes a pixel transient
 PLACE_CELLS = 32  # along an axis, of the table of errors over contracted space
 PLACE_QUANTILE = 0.2  # of the errors at a place in all photos; low, so that people hardly raise it
 PLACE_FACTOR = 1.5  # an error up to so many times that quantile is usual for the place
-QUANTILE_RATE = 0.1  # of a running quantile's logarithm, in a step
+QUANTILE_RATE = 0.1  # a push of 1 moves the logarithm of a quantile by this
 
 
 def complexity(e_grad, e_curv):
@@ -955,7 +947,7 @@ def gpl_loss(mask, phi):
 def mask_loss(logit, excess):
     """L_reg: binary cross entropy that classifies rays (R,) by their error. A ray whose error
     exceeds its threshold (excess > 0) is trained towards M = 1, any other towards M = 0, weighted
-    by |excess|. For a single ray this is least where (1 - M) error + M threshold is, whose own
+    by |excess|. For a single ray the best M is that of (1 - M) error + M threshold, whose own
     gradient vanishes where the sigmoid saturates. With L_GPL the least is at M = min(1, excess /
     (0.05 Phi)): edges of the geometry are masked fully only if their errors exceed the threshold
     by 0.05 and more. [D3]"""
@@ -1055,8 +1047,10 @@ class TransientMask(nn.Module):
             nn.Sequential(conv(3, 16, stride=2), conv(16, 16, stride=1)),
             ContextBlock(16, dilation=2),
             ContextBlock(32, dilation=4))
-        # one bias, as logits are summed
-        self.heads = nn.ModuleList(nn.Conv2d(n, 1, 1, bias=n == 16) for n in (16, 32, 64))
+        self.heads = nn.ModuleList([
+            nn.Conv2d(16, 1, 1),
+            nn.Conv2d(32, 1, 1, bias=False),  # as logits are summed, one bias is enough
+            nn.Conv2d(64, 1, 1, bias=False)])
         nn.init.constant_(self.heads[0].bias, -2.5)  # starts with 8 % masked, not with half
         self.thumbs = nn.Buffer(thumbs, persistent=False)  # (I,3,2m,2m)
 
@@ -1161,7 +1155,7 @@ class GeoNVS(nn.Module):
     def zeta(self):
         """The deviation network: one learned number v, zeta = exp(10 v), clipped as in NeuS's code;
         1 / zeta is the width of a surface."""
-        return torch.exp(10 * self.deviation).clamp(1e-6, 1e6)
+        return torch.exp((10 * self.deviation).clamp(-13.8, 13.8))
 
     def alpha(self, sdf, max_zeta=math.inf):
         """Opacity (R,S) of the intervals between samples with SDF (R,S+1). Eq. 1"""
@@ -1226,7 +1220,9 @@ class GeoNVS(nn.Module):
         is_counted = ~rays.is_masked
         e_grad, e_curv = self.cache.errors(hits.x)  # (R,)
         if self.cfg.printed("phi"):
-            return paper_phi(complexity(e_grad, e_curv / self.cache.side)) * is_counted
+            is_inside = hits.x[:, 0].norm(dim=1) < 1.001  # the cache holds nothing further out
+            ray_complexity = complexity(e_grad, e_curv / self.cache.side) * is_inside
+            return paper_phi(ray_complexity) * is_counted
         return edge_indicator(complexity(e_grad, e_curv), hits.opacity.detach() * is_counted)
 
     def transients(self, rays, photos, place, phi, error, done):
@@ -1241,12 +1237,12 @@ class GeoNVS(nn.Module):
             M = logit.sigmoid()
             is_counted = ~rays.is_masked
             # SfM pixels count as if they had no error: they train M = 0 [D5]
-            error = error.masked_fill(rays.has_sfm, 0)
+            judged = error.masked_fill(rays.has_sfm, 0)
             if self.cfg.printed("reg"):
-                reg = paper_mask_loss(M * is_counted, error)
+                reg = paper_mask_loss(M * is_counted, judged)
                 left_out = M.detach()
             else:
-                excess = error - self.usual_errors.threshold(place)
+                excess = judged - self.usual_errors.threshold(place)
                 reg = mask_loss(logit, excess * is_counted)
                 left_out = reject_outliers(M.detach(), excess > 0, done)
             gpl = gpl_loss(M, phi)
@@ -1276,7 +1272,7 @@ class GeoNVS(nn.Module):
         return random_rays(self.scene, img, gen), picked
 
     def groups(self):
-        """Optimiser groups with their names and learning rates."""
+        """Optimiser groups with their learning rates: networks, grids, codes, mask."""
         cfg = self.cfg
         grids = [octree.features for octree in self.octrees]
         codes = [self.appearance.weight]
@@ -1284,10 +1280,10 @@ class GeoNVS(nn.Module):
         special = set(grids + codes + mask)
         networks = [p for p in self.parameters() if p not in special]
         return [
-            dict(name="networks", params=networks, base_lr=cfg.lr_net),
-            dict(name="grids", params=grids, base_lr=cfg.lr_grid),
-            dict(name="codes", params=codes, base_lr=cfg.lr_code),
-            dict(name="mask", params=mask, base_lr=cfg.lr_mask)]
+            dict(params=networks, base_lr=cfg.lr_net),
+            dict(params=grids, base_lr=cfg.lr_grid),
+            dict(params=codes, base_lr=cfg.lr_code),
+            dict(params=mask, base_lr=cfg.lr_mask)]
 
     def refine(self, optimizer, processes=ALONE):
         """Splits cells where colours err, and the neighbours that share a face with them, as the
@@ -1302,9 +1298,8 @@ class GeoNVS(nn.Module):
         for name in ("exp_avg", "exp_avg_sq"):
             state[name] = carry_over_rows(state[name], is_old)
         optimizer.state[octree.features] = state
-        for group in optimizer.param_groups:
-            if group["name"] == "grids":
-                group["params"] = [tree.features for tree in self.octrees]
+        _, grids, _, _ = optimizer.param_groups
+        grids["params"] = [tree.features for tree in self.octrees]
 
     def codes(self):
         """Appearance codes (I,A) of all photos."""
@@ -1386,15 +1381,28 @@ def training_step(model, optimizer, step, done, gen, processes=ALONE):
     return terms | dict(total=loss.detach())
 
 
-def fingerprint(raw):
-    """What weights depend on: each photo's place in the list, split, size and camera, by its name,
-    and the sphere. Rounded, as other machines prepare a scene with other last digits."""
+def fingerprint(scene):
+    """What weights depend on: each photo's place in the list, split, size, camera and mean colour,
+    by its name, and the sphere."""
+    raw = scene.raw
     count = len(raw["name"])
-    columns = [np.arange(count), raw["is_test"], raw["wh"], raw["K"], raw["c2w"]]
+    # colours weigh a hundredth, as programs decode photos in slightly different ways
+    color = scene.thumbs.mean((2, 3), dtype=torch.float).cpu().numpy() / 25500  # (I,3)
+    columns = [np.arange(count), raw["is_test"], raw["wh"], raw["K"], raw["c2w"], color]
     photos = np.hstack([np.reshape(column, (count, -1)) for column in columns])
     sphere = np.append(raw["center"] / raw["scale"], np.log(raw["scale"]))
-    rows = [row.round(5).tolist() for row in (*photos, sphere)]
+    rows = [row.tolist() for row in (*photos, sphere)]
     return dict(zip([*raw["name"].tolist(), "the sphere"], rows))
+
+
+def changes(before, now):
+    """Names of the rows in which two fingerprints differ by more than the last digits, in which
+    machines differ."""
+    names = before | now
+    is_same = {
+        name: np.allclose(before.get(name, math.nan), now.get(name, math.nan), rtol=0, atol=5e-5)
+        for name in names}
+    return [name for name in names if not is_same[name]]
 
 
 def save(run, model, optimizer, gen, state, terms):
@@ -1410,7 +1418,7 @@ def save(run, model, optimizer, gen, state, terms):
     state.log.append(json.dumps(line) + "\n")
     saved = dict(
         config=vars(model.cfg),
-        scene=fingerprint(model.scene.raw),
+        scene=fingerprint(model.scene),
         octrees=[octree.split_keys.clone() for octree in model.octrees],
         model=model.state_dict(),
         optimizer=optimizer.state_dict(),
@@ -1451,12 +1459,12 @@ def restore(saved, model, gen=None):
     same kind of device. Returns its optimiser and State."""
     with one_sentence("checkpoint.pt does not fit settings or kind of device",
                       "use those it was made with"):
-        before = saved["scene"]
-        now = fingerprint(model.scene.raw)
-        changed = [name for name in before | now if before.get(name) != now.get(name)]
+        changed = changes(saved["scene"], fingerprint(model.scene))
         check(not changed, "checkpoint.pt was trained with other photos, splits, sizes or cameras: "
               f"{len(changed)} differ, first {changed[:1]}: use its data, or another --name")
         for octree, keys in zip(model.octrees, saved["octrees"], strict=True):
+            octree.corner_key = octree.corner_key[:0]  # no corner is carried over
+            octree.features = nn.Parameter(octree.features[:0])
             octree.build(keys.to(octree.child.device))
         model.load_state_dict(saved["model"])
         optimizer = make_optimizer(model)
@@ -1529,8 +1537,8 @@ def train(cfg, scene, run, saved=None, processes=ALONE):
         while done < 1 and not is_stopped:
             terms = training_step(model, optimizer, state.step, done, gen, processes)
             now = time.perf_counter()
-            longest = max(10, 20 * seconds / max(state.step, 1))
-            seconds += min(now - last, longest)  # a pause (Ctrl-Z, a laptop's lid) is no training
+            most = max(10, 20 * seconds / max(state.step, 1))  # of a step; more is a pause
+            seconds += min(now - last, most)  # (Ctrl-Z, a laptop's lid), which is no training
             last = now
             state.step += 1
             # several processes agree now and then, and at the last step
@@ -1819,7 +1827,7 @@ def finish(model, scene, state, run, processes=ALONE):
     is_cuda = scene.c2w.is_cuda
     threads = f"cpu, {torch.get_num_threads()} threads"
     buffers = [tensor for octree in model.octrees for tensor in octree.buffers()]
-    memory = peak_memory(is_cuda)  # of training
+    memory = peak_memory(is_cuda)  # up to here: not of scoring
     pictures = {}
     scores, codes = evaluate(model, scene, make_lpips(), pictures)
     atomic_write(run / "codes.npy", lambda part: np.save(part, codes.cpu()))
@@ -1868,7 +1876,8 @@ def make_parser():
         description=__doc__.splitlines()[0],
         epilog=f"[Dn]: see the head of geonvs.py. Photos on a GPU: {GPU_DEFAULTS}",
         usage=argparse.SUPPRESS)  # so a mistake ends in one sentence
-    parser.add_argument("--resume", action="store_true", help="go on from the run's checkpoint")
+    parser.add_argument(
+        "--resume", action="store_true", help="go on; new --steps stretch all schedules")
     parser.add_argument("--render", action="store_true", help="film a finished run")
     for option in fields(Config):
         if option.name in GROUPS:
