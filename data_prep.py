@@ -15,8 +15,7 @@ is photo.png, photo.jpg.png or photo.jpg. Pixels darker than 128 are left out, a
 pixels whose alpha channel is below 128, in a photo or a mask. A point that most photos
 see in such pixels is dropped.
 
-Functions raise UserError, one sentence that says what to do.
-"""
+Functions raise UserError, one sentence that says what to do."""
 import argparse
 import contextlib
 import gzip
@@ -53,8 +52,7 @@ SCENES = {
     "brandenburg": ("brandenburg_gate", "brandenburg.tsv"),
     "sacre": ("sacre_coeur", "sacre.tsv"),
     "trevi": ("trevi_fountain", "trevi.tsv"),
-    "taj": ("taj_mahal", "taj_mahal.tsv"),
-}
+    "taj": ("taj_mahal", "taj_mahal.tsv")}
 DATA = Path("data")
 ARCHIVE_URL = "https://www.cs.ubc.ca/research/kmyi_data/imw2020/TrainingData/"
 SPLIT_URL = "https://nerf-w.github.io/data/selected_images/"
@@ -294,8 +292,7 @@ def find_sphere(x, weight, photos, contain):
     Centre: geometric median of points x (P,3) by weight. Radius: 1.1 x the distance of
     95 %; if that is a skyline, more than four times the median distance away, only
     nearer points are counted. At least half of the training photos have 30 % of their
-    points inside. All points contain (...,3) are inside.
-    """
+    points inside. All points contain (...,3) are inside."""
     center = np.median(x, axis=0)
     for _ in range(20):  # Weiszfeld
         w = weight / np.maximum(lengths(x - center), EPSILON)
@@ -374,8 +371,7 @@ def build_scene(photos, points, info, contain=()):
 
 def brightness_spread(points, brightness):
     """How much brightness differs between photos: the standard deviation of each photo's
-    median offset from its points' mean brightness. points, brightness: a (M,) per photo.
-    """
+    median offset from its points' mean brightness. points, brightness: a (M,) per photo."""
     all_points = np.concatenate(points)
     mean = np.bincount(all_points, np.concatenate(brightness))
     mean /= np.maximum(np.bincount(all_points), 1)  # (P,)
@@ -400,8 +396,7 @@ def add_statistics(scene):
     0.05 without points. The others are about pixels of training photos without a mask.
     footprint: lower quartile of a pixel's size at points in the sphere.
     exposure_spread: standard deviation of the photos' brightness at the same points.
-    bg_color: seen by rays that miss the sphere, NaN unless 60 % agree.
-    """
+    bg_color: seen by rays that miss the sphere, NaN unless 60 % agree."""
     rgb = scene["rgb"]
     masked = scene.get("masked", np.zeros(len(rgb), bool))
     step = max(1, len(rgb) // 500_000)  # large scenes need not every background pixel
@@ -442,8 +437,7 @@ PERSPECTIVE = {
     2: "fx cx cy k1",
     3: "fx cx cy k1 k2",
     4: "fx fy cx cy k1 k2 p1 p2",
-    6: "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6",
-}
+    6: "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6"}
 OPENCV_DISTORTION = "k1 k2 p1 p2 k3 k4 k5 k6".split()
 
 
@@ -552,8 +546,7 @@ def files_below(folder, levels=7):
     """Files at most so many levels down, without hidden folders and thumbnails.
 
     Links are followed, unlike by rglob. A broken link counts as a file, and so does a
-    folder that may not be read.
-    """
+    folder that may not be read."""
     try:
         paths = sorted(folder.iterdir()) if levels and folder.is_dir() else []
     except PermissionError:
@@ -577,8 +570,7 @@ def starts_with(path, pattern):
 def photo_files(folder, posed=()):
     """{name: path} of the photos below a folder, without masks/ and copies in dense/.
 
-    A file that the model names is one of them, whatever its type.
-    """
+    A file that the model names is one of them, whatever its type."""
     files = {}
     for path in files_below(folder):
         name = path.relative_to(folder).as_posix()
@@ -593,8 +585,7 @@ def photo_files(folder, posed=()):
 def match_names(wanted, there):
     """{wanted name: its name there}: equal, or alike if only one has it on each side.
 
-    Names that differ in case or Unicode form only are alike.
-    """
+    Names that differ in case or Unicode form only are alike."""
     forms = []
     for names in (wanted, there):
         alike = defaultdict(set)
@@ -725,8 +716,7 @@ def split_files(folder, split):
 def read_split(paths, names):
     """{name: whether it is held out} of what split_files finds, with names as they are here.
 
-    A table has NeRF-W's columns; rows with an empty id do not count.
-    """
+    A table has NeRF-W's columns; rows with an empty id do not count."""
     print(f"split by {paths[0]}")
     subsets = {}
     for row in itertools.chain(*map(read_table, paths)):
@@ -775,8 +765,7 @@ def is_cut_off(data):
     """Whether a JPEG or PNG file lacks its end, which OpenCV does not report.
 
     A JPEG ends with its first end mark. A video or raw data may follow, and a segment
-    before it may hold a thumbnail with an end of its own.
-    """
+    before it may hold a thumbnail with an end of its own."""
     if data[:2] != b"\xff\xd8":
         return data[1:4] == b"PNG" and b"IEND" not in data
     at = 2
@@ -850,8 +839,7 @@ def read_opaque(path, is_mask):
 def read_mask(photo, path, size):
     """The mask of a photo by its alpha channel and its mask file, if any, in size (w, h).
 
-    -> uint8 (h,w): 0 is left out, 255 is not. A bad mask is told.
-    """
+    -> uint8 (h,w): 0 is left out, 255 is not. A bad mask is told."""
     w, h = size
     mask = np.full((h, w), 255, np.uint8)
     for file in [photo, path] if path else [photo]:
@@ -873,8 +861,7 @@ def read_mask(photo, path, size):
 def read_usable(model, points, rows, is_held_out, downscale):
     """The photos that can be used, sorted by name. Prints which cannot, and why.
 
-    Of photos with the same pixels one is used for training, or none if one is held out.
-    """
+    Of photos with the same pixels one is used for training, or none if one is held out."""
     masks = mask_files(model.images, model.files)
     photos = []
     first = {}  # by hash of pixels: name of the first photo that has them
@@ -994,8 +981,7 @@ def scene_path(name_or_folder):
 def open_scene(name_or_folder, downscale=2):
     """Scene from its file: made on first use, and anew if the content of a source differs.
 
-    Where the sources are gone the file is all that is needed.
-    """
+    Where the sources are gone the file is all that is needed."""
     path = scene_path(name_or_folder)
     split = None
     if path.exists():
@@ -1034,8 +1020,7 @@ MATERIALS = dict(
     plaster=((0.6, 0.46, 0.34), (0.62, 0.62), 0.15),
     leaf=((0.1, 0.22, 0.05), (0.2, 0.2), 0.45),
     paving=((0.48, 0.42, 0.34), (0.42, 0.42), 0.2),
-    meadow=((0.17, 0.22, 0.08), (0.6, 0.6), 0.1),
-)
+    meadow=((0.17, 0.22, 0.08), (0.6, 0.6), 0.1))
 WITH_WINDOWS = ("sand", "brick", "plaster")
 # Other landmarks may swap the materials of a tuple.
 INTERCHANGEABLE = [("stone", "pale"), ("sand", "brick"), ("tiles", "slate", "copper")]
@@ -1070,8 +1055,7 @@ LANDMARK = [
     Part("box", "annex", "slate", center=(-.76, .24, .65), half=(.23, .28, .09), top=0),
     Part("box", "statue", "pale", center=(-.8, -.35, .28), half=(.09, .09, .08), top=.09),
     Part("column", "statue", "copper", center=(-.8, -.35, .48), half=(.07, .07, .12), top=.04),
-    Part("ball", "statue", "copper", center=(-.8, -.35, .64), half=(.055, .055, .055), top=.055),
-]
+    Part("ball", "statue", "copper", center=(-.8, -.35, .64), half=(.055, .055, .055), top=.055)]
 # A palace around a court that opens to the tourists: nothing stands in its middle.
 PALACE = [
     Part("box", "palace", "stone", center=(0, .06, .03), half=(1, .64, .03), top=1),
@@ -1079,17 +1063,14 @@ PALACE = [
     *[Part("column", "palace", "pale", center=(x, .38, .42), half=(.055, .055, .36), top=.045)
       for x in np.linspace(-.5, .5, 6)],
     Part("box", "palace", "pale", center=(0, .46, .83), half=(.62, .16, .05), top=.62),
-    Part("box", "palace", "tiles", center=(0, .46, .98), half=(.66, .18, .1), top=0),
-]
+    Part("box", "palace", "tiles", center=(0, .46, .98), half=(.66, .18, .1), top=0)]
 for x in (-.82, .82):
     PALACE += [
         Part("box", "palace", "brick", center=(x, .02, .36), half=(.16, .5, .33), top=.16),
-        Part("box", "palace", "slate", center=(x, .02, .77), half=(.2, .54, .08), top=0),
-    ]
+        Part("box", "palace", "slate", center=(x, .02, .77), half=(.2, .54, .08), top=0)]
 TOWN = [
     Part("ground", "town", "paving", center=(0, 0, 0), half=(2.6, 2.6, 0), top=2.6),
-    Part("ground", "town", "meadow", center=(0, 0, 0), half=(np.inf, np.inf, 0), top=np.inf),
-]
+    Part("ground", "town", "meadow", center=(0, 0, 0), half=(np.inf, np.inf, 0), top=np.inf)]
 for x, y, wide, tall in [  # a house: half width, half height; a tree stands before it
     (-7.5, 2, .6, .75), (-6.2, 4.4, .5, .55), (-4, 6.4, .8, .9), (-1.2, 7.6, .5, 1.15),
     (2, 6.8, .7, .7), (4.6, 5.6, .5, .95), (6.8, 3, .6, .65), (7.4, 0, .5, .85),
@@ -1100,8 +1081,7 @@ for x, y, wide, tall in [  # a house: half width, half height; a tree stands bef
     TOWN += [
         Part("box", "town", "plaster", center=(x, y, tall), half=(wide, wide, tall), top=wide),
         Part("box", "town", "slate", center=roof, half=(wide, wide, .25), top=0),
-        Part("ball", "town", "leaf", center=tree, half=(crown, crown, crown), top=crown),
-    ]
+        Part("ball", "town", "leaf", center=tree, half=(crown, crown, crown), top=crown)]
 
 
 def toy_parts(landmark, background=True):
@@ -1184,8 +1164,7 @@ def intersect_part(part, o, d):
     """Distances at which rays o, d (R,3) enter a part; inf for a miss. -> (R,)
 
     A part is a quadric, round in the first n coordinates, with a radius linear in z; a
-    slab cuts it in each other coordinate. A roof has n = 1, a cone n = 2, a ball n = 3.
-    """
+    slab cuts it in each other coordinate. A roof has n = 1, a cone n = 2, a ball n = 3."""
     o = o - part.center
     if part.shape == "ground":
         t = -o[:, 2] / d[:, 2]
@@ -1260,8 +1239,7 @@ def shade(o, d, parts, background, sun, weather):
     """Linear colours along rays, in 0..1: sun, shadow, light of the sky, haze.
 
     o (1,3), d (R,3), sun (3,) -> (R,3)
-    weather (4,): RGB tint of the sky and cloud phase, each in -sky..sky of make_toy.
-    """
+    weather (4,): RGB tint of the sky and cloud phase, each in -sky..sky of make_toy."""
     color = sky_color(d, weather) * background
     t, which = trace(o, d, parts)
     hit = np.flatnonzero(t < np.inf)
@@ -1285,8 +1263,7 @@ def shade(o, d, parts, background, sun, weather):
 def toy_camera(rng, azimuth, size):
     """A tourist's camera at `azimuth` [rad] from the front, in the toy's units.
 
-    -> K (4,), c2w (3,4), width, height
-    """
+    -> K (4,), c2w (3,4), width, height"""
     aspect = rng.choice([4 / 3, 3 / 2, 1.1, 3 / 4, 2 / 3])
     w = round(size * min(1, aspect))
     h = round(size * min(1, 1 / aspect))
@@ -1339,8 +1316,7 @@ def toy_points(rng, photos, surface, seen):
     """Points (P,5) as by SfM, noisy and 1.5 % of them wrong, as in build_scene; sets tracks.
 
     For each photo, surface: points (h*w,3) that the pixels see; seen: their distances
-    (h*w,), inf where a person is in front
-    """
+    (h*w,), inf where a person is in front"""
     samples = []
     count = 3000 // len(photos)
     for x, t in zip(surface, seen):
@@ -1386,8 +1362,7 @@ def make_toy(seed=0, size=96, photos=48, test=8, occluders=0.05, exposure=1.0,
     landmark: another building for every number; -1 is a palace around an empty court,
         seen from the front within 120 degrees
     sun: its azimuth differs from photo to photo by up to so many degrees
-    sky: how much its colour and clouds differ from photo to photo, 0 to 1
-    """
+    sky: how much its colour and clouds differ from photo to photo, 0 to 1"""
     info = dict(locals(), scene="toy", kind="toy", downscale=1, folder=None, split=None)
     check(
         seed >= 0 and size >= 16 and photos >= 4 and test >= 0 and landmark >= -1
@@ -1514,8 +1489,7 @@ def toy_truth(scene, sdf, gradient, mask=None):
 def fetch(folder_url, path):
     """Streams the file of path's name into path, unless that exists.
 
-    The part that came of a broken transfer waits in path.part to be continued.
-    """
+    The part that came of a broken transfer waits in path.part to be continued."""
     if path.exists():
         return
     url = folder_url + path.name
@@ -1597,8 +1571,7 @@ def write_sfm_masks(files, masks, folder):
 def run_sfm(folder):
     """Finds the poses of the raw photos in `folder` by pycolmap -> folder/sparse/{0,1,...}
 
-    The database waits in data/ for a second try and goes after a success.
-    """
+    The database waits in data/ for a second try and goes after a success."""
     images = folder / "images"
     if not images.is_dir():
         images = folder

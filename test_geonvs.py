@@ -2102,7 +2102,9 @@ def plain_losses(model, rays, done):
     z = (x - mean) / np.average((x - mean) ** 2, weights=opacity) ** 0.5
     phi = torch.as_tensor(opacity) * z.sigmoid()
     if cfg.printed("phi"):
-        phi = complexity.sigmoid()
+        misses = hits.x[:, 0].norm(dim=1) > 1.001
+        assert misses.any()  # the sphere, so there is no geometry
+        phi = torch.where(misses, 0, complexity).sigmoid()
     terms = defaultdict(float)
     for r in range(8):
         residual = (rgb[r] - rays.rgb[r]).abs()
