@@ -258,14 +258,16 @@ def load_scene(raw, device="cpu"):
     col, row = (uv[is_seen] * mask_side).astype(int).T
     sfm_pixels = np.zeros((len(thumbs), mask_side, mask_side), bool)
     sfm_pixels[raw["track_photo"][is_seen], row, col] = True
-    arrays = [raw[key] for key in Scene._fields[:7]]  # the file has these under the same names
-    arrays.append(raw.get("masked", np.zeros(0, bool)))
-    arrays += [np.moveaxis(thumbs, 3, 1), sfm_pixels]
-    is_test = raw["is_test"]
-    arrays += [np.flatnonzero(~is_test), np.flatnonzero(is_test)]
-    tensors = [torch.as_tensor(array, device=device) for array in arrays]
-    tensors = [x.float() if x.is_floating_point() else x for x in tensors]
-    return Scene(*tensors, raw, json.loads(str(raw["info"])))
+    arrays = {key: raw[key] for key in ("rgb", "start", "wh", "K", "c2w", "near", "points")}
+    arrays |= dict(
+        masked=raw.get("masked", np.zeros(0, bool)),
+        thumbs=np.moveaxis(thumbs, 3, 1),
+        sfm_pixels=sfm_pixels,
+        train=np.flatnonzero(~raw["is_test"]),
+        test=np.flatnonzero(raw["is_test"]))
+    tensors = {key: torch.as_tensor(array, device=device) for key, array in arrays.items()}
+    tensors = {key: x.float() if x.is_floating_point() else x for key, x in tensors.items()}
+    return Scene(**tensors, raw=raw, info=json.loads(str(raw["info"])))
 
 
 def read_scene(cfg, home=None):
@@ -559,7 +561,7 @@ def seed_octree(octree, points, dense):
 
 def cells_to_split(octree):
     """Cells (N,4) to split: those with the largest summed errors, until they hold SPLIT_SHARE of
-    it. Only cells whose children would be larger than a pixel count. Errors are recorded in cells
+    it. A cell is split only if its children are larger than a pixel. Errors are recorded in cells
     that are not split. [D7]"""
     level = octree.cells[:, 0]  # (N,)
     error, pixel, count = octree.cell_error.T  # (N,) sums over rays
@@ -736,8 +738,8 @@ def inverse_cdf(edges, weight, u):
 def stratified(rays, n, gen=None):
     """Numbers (R,n) for R rays: one in each of n equal strata of 0..1, at a random place, or in the
     middle without a generator."""
-    place = torch.full_like(rays.near, 0.5) if gen is None else uniform(gen, len(rays.near), n)
-    return (torch.arange(n, device=place.device) + place) / n
+    offset = torch.full_like(rays.near, 0.5) if gen is None else uniform(gen, len(rays.near), n)
+    return (torch.arange(n, device=offset.device) + offset) / n
 
 
 def importance_samples(probes, alpha, u):
@@ -875,8 +877,8 @@ def surface_depth(t, sdf, w):
     """Distance (R,) to the surface on rays with samples at t (R,S+1), SDF (R,S+1) and weights w
     (R,S) of the intervals between them. Each interval votes, with its weight, for the place where
     the line through s at its two ends is zero: exact for planes. On a curved surface the lines of
-    other intervals miss the zero. So those in which s does not change its sign have a hundredth of
-    the vote. Where nothing has weight, the last sample counts."""
+    other intervals miss the zero. So all but those that lead from outside to inside have a
+    hundredth of the vote. Where nothing has weight, the last sample counts."""
     start, end = sdf[:, :-1], sdf[:, 1:]
     fraction = start / (start - end).clamp_min(1e-6)  # (R,S) of the interval, up to the zero
     zero = torch.lerp(t[:, :-1], t[:, 1:], fraction)
@@ -966,8 +968,8 @@ def paper_mask_loss(mask, error):
 def reject_outliers(mask, is_outlier, done):
     """M (R,) with outliers, rays whose error exceeds the threshold, set to 1 where M exceeds a
     bar. The bar rises from 0 to 1 over the first REJECTION of training; then nothing is rejected.
-    So at first the scene learns from the rays below their thresholds alone. These grow where all
-    rays err. Later the scene must learn its own details. [D3]"""
+    So at first the scene learns from the rays below their thresholds alone. The thresholds grow
+    where all rays err. Later the scene must learn its own details. [D3]"""
     bar = (done / REJECTION) ** 2
     return torch.where(is_outlier & (mask > bar), 1.0, mask)
 
@@ -1831,14 +1833,12 @@ def finish(model, scene, state, run, processes=ALONE):
     pictures = {}
     scores, codes = evaluate(model, scene, make_lpips(), pictures)
     atomic_write(run / "codes.npy", lambda part: np.save(part, codes.cpu()))
-    if model.octrees:  # rivals in test_geonvs.py have none
-        scores["octree_cells"] = model.sdf.octree.cells[:, 0].bincount().tolist()  # by level
-        vertices, faces = extract_mesh(model)
-        if len(faces) == 0:
-            print(f"  {run}/mesh.ply is empty: no surface lies in the unit sphere; train longer")
-        write_ply(run / "mesh.ply", vertices, faces, to_uint8(mesh_colors(model, vertices)))
-        if "wall" in scene.raw:
-            scores |= toy_truth(model, scene)
+    vertices, faces = extract_mesh(model)
+    if len(faces) == 0:
+        print(f"  {run}/mesh.ply is empty: no surface lies in the unit sphere; train longer")
+    write_ply(run / "mesh.ply", vertices, faces, to_uint8(mesh_colors(model, vertices)))
+    if "wall" in scene.raw:
+        scores |= toy_truth(model, scene)
     metrics = dict(
         scene=scene.info["scene"],
         method=model.name,
@@ -1851,6 +1851,7 @@ def finish(model, scene, state, run, processes=ALONE):
         rays_per_second=processes.count * cfg.rays * state.step / state.seconds,
         parameters=sum(p.numel() for p in model.parameters()),
         model_bytes=sum(tensor.nbytes for tensor in [*model.parameters(), *buffers]),
+        octree_cells=model.sdf.octree.cells[:, 0].bincount().tolist(),  # by level
         peak_memory_bytes=memory,
         protocol="appearance fitted on the left half, scored on the right half",
         has_mask=model.has_mask,

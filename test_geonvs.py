@@ -3884,7 +3884,11 @@ def train_row(cfg, arrays, run, kind):
     with timed, replaced, open(run / "log.txt", "w") as log, contextlib.redirect_stdout(log):
         try:
             model, state = geonvs.train(cfg, scene, run)
-            return geonvs.finish(model, scene, state, run)
+            if not issubclass(kind, Rival):
+                return geonvs.finish(model, scene, state, run)
+            scores, codes = geonvs.evaluate(model, scene)  # it has no surface
+            data_prep.write_png(run / "panel.png", geonvs.draw_panel(model, scene, codes))
+            return scores | dict(steps=state.step, train_seconds=state.seconds)
         except UserError as error:
             if error.__cause__:  # a full disk is no result of the method
                 raise
