@@ -1435,7 +1435,7 @@ def save(run, model, optimizer, gen, state, terms):
 
 
 @contextlib.contextmanager
-def one_sentence(says, advice):
+def as_user_error(says, advice):
     """A UserError for whatever fails with a bad checkpoint: zip, pickle, tensor storage."""
     try:
         yield
@@ -1450,7 +1450,7 @@ def read_checkpoint(path, given):
     replaced by those given."""
     check(path.exists(), f"{path} does not exist: train first, without --resume or --render, or "
           "name the run by the --scene, --data, --seed, --paper or --name it was made with")
-    with one_sentence(f"{path} is damaged, or of another version of geonvs.py", "use that version"):
+    with as_user_error(f"{path} is damaged, or of another version of geonvs.py", "use that version"):
         data_prep.refuse_bomb(path)
         saved = dict(torch.load(path, map_location="cpu", weights_only=True))
         return saved, Config(**saved["config"] | given)
@@ -1459,7 +1459,7 @@ def read_checkpoint(path, given):
 def restore(saved, model, gen=None):
     """Puts a checkpoint's weights into a model, and its random numbers into gen, if given, of the
     same kind of device. Returns its optimiser and State."""
-    with one_sentence("checkpoint.pt does not fit settings or kind of device",
+    with as_user_error("checkpoint.pt does not fit settings or kind of device",
                       "use those it was made with"):
         changed = changes(saved["scene"], fingerprint(model.scene))
         check(not changed, "checkpoint.pt was trained with other photos, splits, sizes or cameras: "
@@ -1502,6 +1502,13 @@ def check_finite(tensors, cfg):
           "rates --lr_grid and --lr_net; an older checkpoint.pt, if any, is still there")
 
 
+def remove_results(run):
+    """Removes what a finished run wrote: it is of a shorter training than the one that goes on."""
+    for name in RESULTS:
+        (run / name).unlink(missing_ok=True)
+    shutil.rmtree(run / "held_out", ignore_errors=True)
+
+
 def train(cfg, scene, run, saved=None, processes=ALONE):
     """Trains until cfg.steps or cfg.minutes; writes checkpoint.pt and log.jsonl below run. saved: a
     checkpoint to go on from. Returns model and state."""
@@ -1524,9 +1531,7 @@ def train(cfg, scene, run, saved=None, processes=ALONE):
         model.refresh_cache()
         return model, state
     if saved and processes.is_first:
-        for name in RESULTS:  # of the shorter training
-            (run / name).unlink(missing_ok=True)
-        shutil.rmtree(run / "held_out", ignore_errors=True)
+        remove_results(run)
         atomic_write(run / "log.jsonl", lambda part: part.write_text("".join(state.log)))
     meter = metered_joules(gen.device, state.joules, processes)
     next(meter, None)  # it counts from here
