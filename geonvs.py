@@ -1450,7 +1450,8 @@ def read_checkpoint(path, given):
     replaced by those given."""
     check(path.exists(), f"{path} does not exist: train first, without --resume or --render, or "
           "name the run by the --scene, --data, --seed, --paper or --name it was made with")
-    with as_user_error(f"{path} is damaged, or of another version of geonvs.py", "use that version"):
+    with as_user_error(f"{path} is damaged, or of another version of geonvs.py",
+                       "use that version"):
         data_prep.refuse_bomb(path)
         saved = dict(torch.load(path, map_location="cpu", weights_only=True))
         return saved, Config(**saved["config"] | given)
