@@ -1400,11 +1400,10 @@ def fingerprint(scene):
 def changes(before, now):
     """Names of the rows in which two fingerprints differ by more than the last digits, in which
     machines differ."""
-    names = before | now
-    is_same = {
-        name: np.allclose(before.get(name, math.nan), now.get(name, math.nan), rtol=0, atol=5e-5)
-        for name in names}
-    return [name for name in names if not is_same[name]]
+    nan = math.nan  # of a missing row: it equals nothing
+    return [
+        name for name in before | now
+        if not np.allclose(before.get(name, nan), now.get(name, nan), rtol=0, atol=5e-5)]
 
 
 def save(run, model, optimizer, gen, state, terms):
@@ -1545,8 +1544,9 @@ def train(cfg, scene, run, saved=None, processes=ALONE):
         while done < 1 and not is_stopped:
             terms = training_step(model, optimizer, state.step, done, gen, processes)
             now = time.perf_counter()
-            most = max(10, 20 * seconds / max(state.step, 1))  # of a step; more is a pause
-            seconds += min(now - last, most)  # (Ctrl-Z, a laptop's lid), which is no training
+            # a step of many times the usual length is a pause: Ctrl-Z, a laptop's lid
+            longest = max(10, 20 * seconds / max(state.step, 1))
+            seconds += min(now - last, longest)
             last = now
             state.step += 1
             # several processes agree now and then, and at the last step
