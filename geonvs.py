@@ -31,7 +31,7 @@ Conventions
   mask      M = 1 means transient (person, car), M = 0 means static scene
   symbols   s signed distance; zeta sharpness of the surface (1 / zeta is its width); eps step of
             finite differences; lap Laplacian; E_grad = (|grad s| - 1)^2; E_curv = |lap s| step [D2]
-  shapes    R rays, S intervals of a ray (S + 1 samples), K intervals or points on a ray, P points,
+  shapes    R rays, S intervals of a ray (S + 1 samples), J intervals or points on a ray, P points,
             N octree cells, L octree levels, C channels per level, V feature rows, G inputs of the
             colour network from geometry, A appearance dims, I photos in all, B of them in a batch,
             Q SfM points, T sightings, m side of a mask, n: see the line, "." any length
@@ -724,9 +724,9 @@ def composite(alpha):
 
 
 def inverse_cdf(edges, weight, u):
-    """Positions (R,S) where the linear CDF of weight (R,K) on edges (R,K+1) reaches u (R,S)."""
+    """Positions (R,S) where the linear CDF of weight (R,J) on edges (R,J+1) reaches u (R,S)."""
     cdf = weight.cumsum(1)
-    cdf = F.pad(cdf / cdf[:, -1:], (1, 0))  # (R,K+1)
+    cdf = F.pad(cdf / cdf[:, -1:], (1, 0))  # (R,J+1)
     right = torch.searchsorted(cdf, u, right=True).clamp_max(weight.shape[1])  # (R,S) from 1
     left = right - 1
     below = cdf.gather(1, left)
@@ -743,9 +743,9 @@ def stratified(rays, n, gen=None):
 
 
 def importance_samples(probes, alpha, u):
-    """Distances (R,S+1): the first and the last of the probes (R,K+1), and between them those of
+    """Distances (R,S+1): the first and the last of the probes (R,J+1), and between them those of
     the stratified numbers u (R,S-1). They are dense where the intervals between probes, of opacity
-    alpha (R,K), have weight."""
+    alpha (R,J), have weight."""
     weight = composite(alpha)
     uniform_weight = UNIFORM_SHARE * weight.mean(1, keepdim=True)
     weight = weight + uniform_weight + 1e-5  # an empty ray has uniform samples
@@ -775,17 +775,17 @@ class SDFCache(nn.Module):
         self.volume[0] = torch.stack([s, *central_differences(s)])
 
     def lookup(self, x, channels):
-        """Values (.,R,K) of some channels at x (R,K,3), trilinear."""
-        grid = x.flip(-1)[None, None]  # (1,1,R,K,3), z first as grid_sample wants it
+        """Values (.,R,J) of some channels at x (R,J,3), trilinear."""
+        grid = x.flip(-1)[None, None]  # (1,1,R,J,3), z first as grid_sample wants it
         volume = self.volume[:, channels]
         return F.grid_sample(volume, grid, padding_mode="border", align_corners=True)[0, :, 0]
 
     def sdf(self, x):
-        """s (R,K) at x (R,K,3)."""
+        """s (R,J) at x (R,J,3)."""
         return self.lookup(x, slice(0, 1))[0]
 
     def errors(self, x):
-        """E_grad and E_curv (R,) of rays with samples x (R,K,3): ray-wise averages. Eq. 4 [D6]"""
+        """E_grad and E_curv (R,) of rays with samples x (R,J,3): ray-wise averages. Eq. 4 [D6]"""
         return self.lookup(x, slice(1, 3)).mean(2)
 
 
@@ -835,44 +835,6 @@ class Background(nn.Module):
         return color, place
 
 
-class Hits(NamedTuple):
-    """What rays meet, indexed by the ray. depth, point and place have no gradient."""
-    x: Tensor  # (R,S+1,3) samples in the sphere
-    geo: Tensor  # (R,S+1,G) inputs of the colour network there
-    w: Tensor  # (R,S+1) their weights
-    opacity: Tensor  # (R,) of the foreground
-    depth: Tensor  # (R,) distance to the surface; t1 if none is met
-    point: Tensor  # (R,3) the surface point
-    bg_color: Tensor  # (R,3) of what lies beyond the sphere
-    # (R,3) where the ray ends, in contracted space: the surface point if the foreground is solid,
-    # else the mean position of the background
-    place: Tensor
-
-
-def trace_rays(model, rays, code, gen=None):
-    """Hits of a batch of rays under appearance codes (R,A). Samples lie at random places of their
-    strata, or in the middle without a generator."""
-    t0, t1 = sphere_interval(rays.o, rays.d, rays.near)  # (R,1)
-    t = model.sample(rays, t0, t1, gen)  # (R,S+1)
-    x = rays.at(t)  # (R,S+1,3)
-    sdf, geo = model.sdf(x)  # (R,S+1), (R,S+1,G)
-    interval_w = composite(model.alpha(sdf))  # (R,S)
-    opacity = interval_w.sum(1)  # (R,)
-    depth = surface_depth(t, sdf.detach(), interval_w.detach())
-    point = rays.at(depth[:, None])[:, 0]  # (R,3)
-    # alpha belongs to intervals, colour to samples: an interval gives half of its weight to the
-    # sample at either end [D1]
-    w = F.avg_pool1d(interval_w, 2, stride=1, padding=1)  # (R,S+1)
-
-    bg_color = model.bg_color.expand_as(rays.d)  # (R,3)
-    bg_place = 2 * rays.d  # (R,3) infinity
-    if model.background:
-        per_ray = torch.cat([rays.d, code], 1)  # (R,3+A)
-        bg_color, bg_place = model.background(rays, t1, per_ray, gen)
-    place = torch.where(opacity[:, None] > 0.5, point, bg_place)
-    return Hits(x, geo, w, opacity, depth, point, bg_color, place)
-
-
 def surface_depth(t, sdf, w):
     """Distance (R,) to the surface on rays with samples at t (R,S+1), SDF (R,S+1) and weights w
     (R,S) of the intervals between them. Each interval votes, with its weight, for the place where
@@ -887,13 +849,18 @@ def surface_depth(t, sdf, w):
     return ((w * zero).sum(1) + 1e-8 * t[:, -1]) / (w.sum(1) + 1e-8)
 
 
-def shade(model, rays, code, hits, normal):
-    """Colours (R,3) of rays with hits and normals (R,3) at their surface points. All samples of a
-    ray share its normal, which is no input in the paper. [D6]"""
-    per_ray = torch.cat([normal, rays.d, code], 1)  # (R,3+3+A)
-    rgb = colors_of(model.color, hits.geo, per_ray)  # (R,S+1,3)
-    rgb = torch.einsum("rs,rsc->rc", hits.w, rgb)  # (R,3)
-    return rgb + (1 - hits.opacity[:, None]) * hits.bg_color
+class Hits(NamedTuple):
+    """What rays meet, indexed by the ray. depth, point and place have no gradient."""
+    x: Tensor  # (R,S+1,3) samples in the sphere
+    geo: Tensor  # (R,S+1,G) inputs of the colour network there
+    w: Tensor  # (R,S+1) their weights
+    opacity: Tensor  # (R,) of the foreground
+    depth: Tensor  # (R,) distance to the surface; t1 if none is met
+    point: Tensor  # (R,3) the surface point
+    bg_color: Tensor  # (R,3) of what lies beyond the sphere
+    # (R,3) where the ray ends, in contracted space: the surface point if the foreground is solid,
+    # else the mean position of the background
+    place: Tensor
 
 
 class Rendering(NamedTuple):
@@ -1177,6 +1144,37 @@ class GeoNVS(nn.Module):
         alpha = self.alpha(self.cache.sdf(rays.at(probes)), max_zeta=self.cache.n)
         return importance_samples(probes, alpha, stratified(rays, self.cfg.samples - 1, gen))
 
+    def trace(self, rays, code, gen=None):
+        """Hits of a batch of rays under appearance codes (R,A). Samples lie at random places of
+        their strata, or in the middle without a generator."""
+        t0, t1 = sphere_interval(rays.o, rays.d, rays.near)  # (R,1)
+        t = self.sample(rays, t0, t1, gen)  # (R,S+1)
+        x = rays.at(t)  # (R,S+1,3)
+        sdf, geo = self.sdf(x)  # (R,S+1), (R,S+1,G)
+        interval_w = composite(self.alpha(sdf))  # (R,S)
+        opacity = interval_w.sum(1)  # (R,)
+        depth = surface_depth(t, sdf.detach(), interval_w.detach())
+        point = rays.at(depth[:, None])[:, 0]  # (R,3)
+        # alpha belongs to intervals, colour to samples: an interval gives half of its weight to
+        # the sample at either end [D1]
+        w = F.avg_pool1d(interval_w, 2, stride=1, padding=1)  # (R,S+1)
+
+        bg_color = self.bg_color.expand_as(rays.d)  # (R,3)
+        bg_place = 2 * rays.d  # (R,3) infinity
+        if self.background:
+            per_ray = torch.cat([rays.d, code], 1)  # (R,3+A)
+            bg_color, bg_place = self.background(rays, t1, per_ray, gen)
+        place = torch.where(opacity[:, None] > 0.5, point, bg_place)
+        return Hits(x, geo, w, opacity, depth, point, bg_color, place)
+
+    def shade(self, rays, code, hits, normal):
+        """Colours (R,3) of rays with hits and normals (R,3) at their surface points. All samples of
+        a ray share its normal, which is no input in the paper. [D6]"""
+        per_ray = torch.cat([normal, rays.d, code], 1)  # (R,3+3+A)
+        rgb = colors_of(self.color, hits.geo, per_ray)  # (R,S+1,3)
+        rgb = torch.einsum("rs,rsc->rc", hits.w, rgb)  # (R,3)
+        return rgb + (1 - hits.opacity[:, None]) * hits.bg_color
+
     def losses(self, rays, photos, done, gen):
         """The objective of rays that come photo by photo, equally many of each of photos (B,);
         done: share of training, 0..1. Returns the total, and a dictionary for the log. Remembers
@@ -1184,7 +1182,7 @@ class GeoNVS(nn.Module):
         cfg = self.cfg
         R = len(rays.o)
         code = self.appearance(photos).repeat_interleave(R // len(photos), 0)  # (R,A)
-        hits = trace_rays(self, rays, code, gen)
+        hits = self.trace(rays, code, gen)
         n = math.ceil(R / 4)
         sfm = self.sfm[random_index(gen, len(self.sfm), n)]  # (n,3)
         start, end = self.air[random_index(gen, len(self.air), n)].unbind(1)  # (n,3)
@@ -1194,7 +1192,7 @@ class GeoNVS(nn.Module):
         opacity = hits.opacity.detach()
         eik_weight = torch.cat([opacity, opacity.new_ones(2 * n)])  # (R+2n,)
 
-        rgb = shade(self, rays, code, hits, F.normalize(grad[:R]))  # (R,3)
+        rgb = self.shade(rays, code, hits, F.normalize(grad[:R]))  # (R,3)
         residual = (rgb - rays.rgb).abs()  # (R,3)
         error = residual.detach().amax(1)  # (R,) of the worst channel
         phi = self.phi(rays, hits)  # (R,)
@@ -1309,10 +1307,10 @@ class GeoNVS(nn.Module):
 
     def render(self, rays, code):
         """Rendering of rays under codes (R,A): for pictures, and to fit codes."""
-        hits = trace_rays(self, rays, code)
+        hits = self.trace(rays, code)
         _, grad, _ = self.sdf.derivatives(hits.point, self.eps)
         normal = F.normalize(grad)
-        rgb = shade(self, rays, code, hits, normal)
+        rgb = self.shade(rays, code, hits, normal)
         return Rendering(rgb, hits.opacity, hits.depth, normal * hits.opacity[:, None])
 
 
@@ -1509,23 +1507,29 @@ def remove_results(run):
     shutil.rmtree(run / "held_out", ignore_errors=True)
 
 
+def start(cfg, scene, saved=None, processes=ALONE):
+    """Model, optimiser, generator and State: new ones, or those of a checkpoint, `saved`."""
+    torch.manual_seed(cfg.seed)
+    own_seed = cfg.seed * processes.count + processes.rank
+    gen = torch.Generator(scene.c2w.device).manual_seed(own_seed)
+    with gen.device:
+        model = GeoNVS(cfg, scene)
+    if saved is None:
+        return model, make_optimizer(model), gen, State()
+    # the first process goes on with its random numbers, the others begin theirs again
+    optimizer, state = restore(saved, model, gen if processes.is_first else None)
+    if not processes.is_first:
+        model.sdf.octree.cell_error.zero_()  # saved sums are those of the first process
+    return model, optimizer, gen, state
+
+
 def train(cfg, scene, run, saved=None, processes=ALONE):
     """Trains until cfg.steps or cfg.minutes; writes checkpoint.pt and log.jsonl below run. saved: a
     checkpoint to go on from. Returns model and state."""
     print(f"{GeoNVS.name} on {scene.info['scene']}: {len(scene.wh)} photos, "
           f"{len(scene.test)} held out; {scene.c2w.device}; {run}/")
     torch.set_flush_denormal(True)  # vanishing weights would otherwise slow a CPU down
-    torch.manual_seed(cfg.seed)
-    own_seed = cfg.seed * processes.count + processes.rank
-    gen = torch.Generator(scene.c2w.device).manual_seed(own_seed)
-    with gen.device:
-        model = GeoNVS(cfg, scene)
-    optimizer = make_optimizer(model)
-    state = State()
-    if saved:  # the first process goes on with its random numbers, the others begin theirs again
-        optimizer, state = restore(saved, model, gen if processes.is_first else None)
-        if not processes.is_first:
-            model.sdf.octree.cell_error.zero_()  # saved sums are those of the first process
+    model, optimizer, gen, state = start(cfg, scene, saved, processes)
     done = state.share_done(cfg)
     if done >= 1:
         model.refresh_cache()

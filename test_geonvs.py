@@ -1883,7 +1883,7 @@ def plain_derivatives(model, x):
 
 
 def plain_render(model, o, d, t, code, part):
-    """What trace_rays and shade return for one ray, in one row, sample by sample."""
+    """What trace and shade return for one ray, in one row, sample by sample."""
     zeta = torch.exp(10 * model.deviation)
     samples = [plain_sdf(model, o + distance * d) for distance in t]
     phi = [(zeta * s).sigmoid() for s, _ in samples]
@@ -1943,7 +1943,7 @@ def shaded(model, rays, code, hits):
     """Colours (R,3) and normals (R,3) of hits."""
     _, grad, _ = model.sdf.derivatives(hits.point, model.eps)
     normal = F.normalize(grad)
-    return geonvs.shade(model, rays, code, hits, normal), normal
+    return model.shade(rays, code, hits, normal), normal
 
 
 @pytest.mark.parametrize("background", ["on", "off"])
@@ -1955,7 +1955,7 @@ def test_rendering_and_its_gradients_equal_plain_loops(double, background):
     part = geonvs.stratified(rays, 12, gen)
     rows = zip(rays.o, rays.d, t, code, part)
     wanted = [plain_render(model, *row) for row in rows]
-    hits = geonvs.trace_rays(model, rays, code, generator())
+    hits = model.trace(rays, code, generator())
     rgb, normal = shaded(model, rays, code, hits)
     found = torch.column_stack([rgb, hits.opacity, hits.depth, normal, hits.point, hits.place])
     assert_one_function(model, found, torch.stack(wanted))
@@ -1969,7 +1969,7 @@ def test_a_new_model_shows_a_small_ball(warm, aside, opacity, depth):
     rays = fake_rays(-3 * d + aside * right, d)  # the ball's radius is 0.25
     code = warm.codes()[:1].expand(50, -1)
     out = warm.render(rays, code)
-    hits = geonvs.trace_rays(warm, rays, code)
+    hits = warm.trace(rays, code)
     wanted, normal = shaded(warm, rays, code, hits)
     assert_tensors_close(out.normal, normal * hits.opacity[:, None])
     assert_tensors_close(out.opacity, [opacity] * 50, 0.02)
@@ -2087,7 +2087,7 @@ def plain_losses(model, rays, done):
     cfg = model.cfg
     gen = generator()
     code = model.appearance(rays.img)
-    hits = geonvs.trace_rays(model, rays, code, gen)
+    hits = model.trace(rays, code, gen)
     sfm = model.sfm[torch.randint(len(model.sfm), (2,), generator=gen)]
     air = model.air[torch.randint(len(model.air), (2,), generator=gen)]
     part = geonvs.uniform(gen, 2, 1)
@@ -3486,7 +3486,7 @@ class NeRFW(Rival):
         return geonvs.Rendering(out["rgb"], none[:, 0], out["depth"], none)
 
     def trace(self, rays, code, other=None, gen=None):
-        """Coarse and fine pass with n samples and 2n, as in geonvs.trace_rays. other: codes (R,16)
+        """Coarse and fine pass with n samples and 2n, as in GeoNVS.trace. other: codes (R,16)
         of the transient head."""
         n = self.cfg.samples
         far = self.far[rays.img, None]  # (R,1)
