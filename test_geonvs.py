@@ -3756,6 +3756,21 @@ class Density(geonvs.GeoNVS):
         return 1 - torch.exp(-sigma * self.length)
 
 
+class NoNormal(geonvs.GeoNVS):
+    """Colours do not see the normal."""
+
+    def shade(self, rays, code, hits, normal):
+        return super().shade(rays, code, hits, torch.zeros_like(normal))
+
+
+class NoRejection(geonvs.GeoNVS):
+    """Outliers are never rejected."""
+
+    def transients(self, rays, photos, place, phi, error, done):
+        done = max(done, geonvs.REJECTION)
+        return super().transients(rays, photos, place, phi, error, done)
+
+
 class UniformGrid(geonvs.GeoNVS):
     """Every cell of the foreground is split, down to the last level."""
     name = "uniform grid"
@@ -3779,6 +3794,7 @@ class Row(NamedTuple):
     settings: dict = {}  # of Config
     kind: type = geonvs.GeoNVS
     toy: dict = {}  # knobs of data_prep.make_toy; none: the scene that flags name
+    constants: dict = {}  # of geonvs.py, that have another value
 
 
 BUDGETS = dict(  # unless --steps or --minutes is given
@@ -3811,6 +3827,10 @@ PARTS = {
     "no mask": Row(dict(mask="off")),
     "no codes": Row(dict(appearance="off")),
     "no background": Row(dict(background="off")),
+    "no normal as an input": Row(kind=NoNormal),
+    "no uniform samples": Row(constants=dict(UNIFORM_SHARE=0.0)),
+    "no threshold by place": Row(constants=dict(PLACE_FACTOR=0.0)),
+    "no early rejection": Row(kind=NoRejection),
     "density": METHODS["density"]}
 GRID = {"octree": Row(), "uniform grid": Row(kind=UniformGrid)}
 STRESS = {  # knobs of a toy, and the row of PARTS without what is made for it
@@ -3853,7 +3873,7 @@ def run_row(run, given, row):
     """Metrics of one training. They are read if the run is there with the same settings; a
     training that diverged is a result, too."""
     cfg = geonvs.make_config(given | row.settings)
-    key = dict(config=asdict(cfg), toy=row.toy, method=row.kind.name)
+    key = dict(config=asdict(cfg), toy=row.toy, constants=row.constants, method=row.kind.__name__)
     path = run / "row.json"
     saved = json.loads(path.read_text()) if path.exists() else {}
     if saved.get("key") != key:
@@ -3862,7 +3882,8 @@ def run_row(run, given, row):
         else:
             arrays = data_prep.open_scene(cfg.source, cfg.downscale)
         data_prep.check(arrays["is_test"].any(), "experiments need held-out photos: see README")
-        saved = dict(key=key, metrics=train_row(cfg, arrays, run, row.kind))
+        with mock.patch.dict(vars(geonvs), row.constants):
+            saved = dict(key=key, metrics=train_row(cfg, arrays, run, row.kind))
         data_prep.atomic_write(path, lambda part: part.write_text(json.dumps(saved)))
     metrics = saved["metrics"]
     result = metrics.get("failed") or f"{metrics['psnr']:.2f} dB"
