@@ -1556,7 +1556,9 @@ def sfm_photos(images):
 
 
 def write_sfm_masks(files, masks, folder):
-    """Writes masks in the photos' sizes under COLMAP's names, photo.jpg.png."""
+    """Writes masks in the photos' sizes under COLMAP's names, photo.jpg.png, white ones for photos
+    without: COLMAP 4 wants one for each photo or none at all. Returns whether any pixel is black."""
+    is_needed = False
     for name, path in progress(files.items(), "looking for masks"):
         try:
             photo = read_image(path, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
@@ -1564,8 +1566,9 @@ def write_sfm_masks(files, masks, folder):
             warn(f"{name} {e}")
             continue
         mask = read_mask(path, masks.get(name), photo.shape[1::-1])
-        if not mask.all():
-            write_png(folder / f"{name}.png", np.stack([mask] * 3, axis=-1))
+        is_needed |= not mask.all()
+        write_png(folder / f"{name}.png", np.stack([mask] * 3, axis=-1))
+    return is_needed
 
 
 def run_sfm(folder):
@@ -1590,8 +1593,8 @@ def run_sfm(folder):
     work = DATA / f"sfm-{checksum([*files.values(), *masks.values()]):08x}"
     database = work / "database.db"
     (work / "masks").mkdir(parents=True, exist_ok=True)
-    write_sfm_masks(files, masks, work / "masks")
-    reader.mask_path = work / "masks"
+    if write_sfm_masks(files, masks, work / "masks"):
+        reader.mask_path = work / "masks"
     # Of 135 photos of a statue in all lights these options pose 104 in one model, not 60.
     features.sift.estimate_affine_shape = True
     features.sift.domain_size_pooling = True

@@ -1372,6 +1372,7 @@ def test_sfm_calls_pycolmap_in_order(pycolmap):
     assert pycolmap.FeatureMatchingOptions().guided_matching is True
     assert extract[0] == "extract_features"
     assert photos == [IMAGES, toy()["name"].tolist()]
+    assert "mask_path" not in vars(extract[2]["reader_options"])  # no photo has a mask
     assert match[:2] == ("match_exhaustive", (database,))
     assert map_photos[0] == "incremental_mapping"
     assert map_photos[1][:2] == (database, IMAGES)
@@ -1390,15 +1391,16 @@ def test_a_second_sfm_takes_up_the_first(pycolmap):
     pycolmap.incremental_mapping.side_effect = OSError(28, "No space left")
     assert_error("No space left", "place --sfm")
     assert sorted(os.listdir("place")) == ["images", "masks", "toy.tsv"]
-    mask, transparent = sorted(Path("data").rglob("masks/*"))
-    assert mask.name == "toy_000.png.png"  # COLMAP's name
-    assert np.array_equal(cv2.imread(str(mask), cv2.IMREAD_GRAYSCALE), BLACK_LEFT[::2, ::2])
-    assert (cv2.imread(str(transparent), cv2.IMREAD_GRAYSCALE) == 0).mean() == 1 / 4
+    paths = sorted(Path("data").rglob("masks/*"))
+    assert [path.name[:-4] for path in paths] == toy()["name"].tolist()  # COLMAP's names
+    mask, bad, none, transparent, *_ = [cv2.imread(str(path), 0) for path in paths]
+    assert np.array_equal(mask, BLACK_LEFT[::2, ::2])
+    assert (transparent == 0).mean() == 1 / 4 and bad.all() and none.all()
     pycolmap.incremental_mapping.side_effect = works
     made("--sfm")
     first, second = pycolmap.extract_features.call_args_list
     assert first[0] == second[0]
-    assert second[1]["reader_options"].mask_path == mask.parent
+    assert second[1]["reader_options"].mask_path == paths[0].parent
 
 
 def test_renamed_photos_are_matched_anew(model):
