@@ -30,7 +30,8 @@ Conventions
   sdf       positive outside; the normal is the unit gradient; colours are sRGB in [0, 1]
   mask      M = 1 means transient (person, car), M = 0 means static scene
   symbols   s signed distance; zeta sharpness of the surface (1 / zeta is its width); eps step of
-            finite differences; lap Laplacian; E_grad = (|grad s| - 1)^2; E_curv = |lap s| step [D2]
+            finite differences; lap Laplacian; E_grad = (|grad s| - 1)^2; E_curv = |lap s| h,
+            h the step of the difference [D2]
   shapes    R rays, S intervals of a ray (S + 1 samples), J intervals or points on a ray, P points,
             N octree cells, L octree levels, C channels per level, V feature rows, G inputs of the
             colour network from geometry, A appearance dims, I photos in all, B of them in a batch,
@@ -138,7 +139,7 @@ class Config:
     lam_gpl: float = setting(0.05, "L_GPL, geometry preservation")
     lam_lps: float = setting(3e-6, "L_lps, Lipschitz bound (as Permuto-SDF)")
     lam_sfm: float = setting(7.5e-3, "min(zeta, 40) |s(p)| at SfM points [D5]")
-    lam_off: float = setting(0.03, "L_off, off-surface: air that cameras see [D5]")
+    lam_off: float = setting(0.03, "min(zeta, 40) L_off, off-surface [D5]")
     lr_grid: float = setting(1e-2, "octree features")
     lr_code: float = setting(3e-2, "appearance codes")
     lr_net: float = setting(4e-3, "networks")
@@ -149,7 +150,7 @@ class Config:
         for option in fields(self):
             value = getattr(self, option.name)
             least = option.metadata.get("least", 0)
-            choices = option.metadata.get("choices", [value])
+            choices = option.metadata.get("choices", [value])  # without choices any value is one
             words = ", ".join(map(str, choices))
             check(value in choices, f"--{option.name} {value} is unknown: use one of {words}")
             check(option.type is str or least <= value < 2**31,
@@ -270,13 +271,14 @@ def load_scene(raw, device="cpu"):
     return Scene(**tensors, raw=raw, info=json.loads(str(raw["info"])))
 
 
-def read_scene(cfg, home=None):
+def find_scene(cfg, home=None):
     """The dictionary of the scene file that settings name; the file is made on first use. home: the
     folder in which a run was trained, if another one than here."""
-    if home and (home / data_prep.scene_path(cfg.source)).exists() and not home.samefile("."):
-        return data_prep.read_scene(home / data_prep.scene_path(cfg.source))
+    path = data_prep.scene_path(cfg.source)
+    if home and (home / path).exists() and not home.samefile("."):
+        return data_prep.read_scene(home / path)
     is_there = not cfg.data or Path(cfg.data).is_dir()
-    check(is_there or data_prep.scene_path(cfg.source).exists(),
+    check(is_there or path.exists(),
           f"{cfg.data} does not exist: give the folder's place by --data; a run that was trained "
           "with its old place also needs --name")
     return data_prep.open_scene(cfg.source, cfg.downscale)
@@ -287,7 +289,7 @@ class Rays(NamedTuple):
     o: Tensor  # (R,3) origin
     d: Tensor  # (R,3) unit direction
     near: Tensor  # (R,1)
-    img: Tensor  # (R,) photo index
+    photo: Tensor  # (R,) its index
     uv: Tensor  # (R,2) pixel position over photo size, 0..1
     rgb: Tensor  # (R,3) the photo's colour
     has_sfm: Tensor  # (R,) whether the mask's pixel shows an SfM point [D5]
@@ -298,25 +300,25 @@ class Rays(NamedTuple):
         return torch.addcmul(self.o[:, None], t[..., None], self.d[:, None])
 
 
-def make_rays(scene, img, pixel):
-    """Rays through pixels. img, pixel: (R,) photo, and row-major index in it."""
-    wh = scene.wh[img]  # (R,2)
+def make_rays(scene, photo, pixel):
+    """Rays through pixels. photo, pixel: (R,) index of a photo, and row-major index in it."""
+    wh = scene.wh[photo]  # (R,2)
     w = wh[:, 0]
-    focal, centre = scene.K[img].split(2, 1)  # (R,2)
-    c2w = scene.c2w[img]  # (R,3,4)
+    focal, centre = scene.K[photo].split(2, 1)  # (R,2)
+    c2w = scene.c2w[photo]  # (R,3,4)
     xy = torch.stack([pixel % w, pixel // w], 1) + 0.5  # (R,2) px
     d = (xy - centre) / focal  # (R,2)
     d = F.normalize(F.pad(d, (0, 1), value=1.0))  # (R,3) in camera axes
     d = torch.einsum("rij,rj->ri", c2w[..., :3], d)  # (R,3) in world axes
-    index = scene.start[img] + pixel  # (R,) among all pixels
+    index = scene.start[photo] + pixel  # (R,) among all pixels
     rgb = scene.rgb[index] / 255
     uv = xy / wh  # (R,2)
     col, row = (uv * scene.sfm_pixels.shape[1]).long().unbind(1)  # (R,) of the mask's pixel
-    has_sfm = scene.sfm_pixels[img, row, col]
+    has_sfm = scene.sfm_pixels[photo, row, col]
     is_masked = torch.zeros_like(has_sfm)
     if len(scene.masked):
         is_masked = scene.masked[index]
-    return Rays(c2w[..., 3], d, scene.near[img, None], img, uv, rgb, has_sfm, is_masked)
+    return Rays(c2w[..., 3], d, scene.near[photo, None], photo, uv, rgb, has_sfm, is_masked)
 
 
 def uniform(gen, *shape):
@@ -329,12 +331,12 @@ def random_index(gen, n, count):
     return torch.randint(n, (count,), generator=gen, device=gen.device)
 
 
-def random_rays(scene, img, gen, part=1.0):
-    """Rays through random pixels of the photos img (R,), of the left `part` of each."""
-    w, h = scene.wh[img].unbind(1)
-    u, v = uniform(gen, 2, len(img))
+def random_rays(scene, photo, gen, part=1.0):
+    """Rays through random pixels of photos (R,), one each, of the left `part` of the photo."""
+    w, h = scene.wh[photo].unbind(1)
+    u, v = uniform(gen, 2, len(photo))
     col = (u * (part * w).long()).long()
-    return make_rays(scene, img, (v * h).long() * w + col)
+    return make_rays(scene, photo, (v * h).long() * w + col)
 
 
 def sphere_interval(o, d, near):
@@ -433,8 +435,8 @@ class Octree(nn.Module):
         o---o---o
 
     So the features of a level fade to 0 at the border of what it refines, and of the cube; they are
-    continuous. Where a level has no cell, its features are 0. `cells[n]` is cell n; `child[n]` is
-    the row of its first child, and `corner[n]` holds the feature rows of its eight corners.
+    continuous. Where a level has no cell, its features are 0. `cells[n]` is (level, i, j, k) of
+    cell n, `child[n]` the row of its first child; `corner[n]` holds the rows of its eight features.
     `corner_key` names the corner of each feature, so that features survive a rebuild."""
     def __init__(self, half, levels, channels=4, root=ROOT):
         super().__init__()
@@ -483,14 +485,15 @@ class Octree(nn.Module):
         cells = torch.cat(cells)
         is_split = torch.cat(is_split)
         first_child = self.root**3 + 8 * (is_split.cumsum(0) - 1)  # (N,)
-        corners = pack_index(cells)[:, None] + pack_index(F.pad(octants, (1, 0)))  # (N,8) keys
+        # keys add up as indices do: (N,8)
+        corners = pack_index(cells)[:, None] + pack_index(F.pad(octants, (1, 0)))
         key, corner, cells_around = corners.unique(return_inverse=True, return_counts=True)  # (.,)
         has_feature = cells_around == 8
         row = (has_feature.cumsum(0) - 1).clamp_min(0)  # of a corner's feature; any, where hanging
         key = key[has_feature]  # (V,)
         is_old = torch.isin(key, self.corner_key)
 
-        # a checkpoint holds cell_error alone: the other buffers follow from split_keys
+        # of these buffers a checkpoint holds split_keys and cell_error, from which the rest follows
         self.split_keys = nn.Buffer(split_keys, persistent=False)
         self.corner_key = nn.Buffer(key, persistent=False)  # (V,) sorted, the corner of each row
         self.features = nn.Parameter(carry_over_rows(self.features, is_old))
@@ -500,7 +503,7 @@ class Octree(nn.Module):
         self.is_hanging = nn.Buffer(~has_feature[corner], persistent=False)  # (N,8)
         # (N,3) sums over rays that hit a cell: of errors, of pixel sizes there, their number
         self.cell_error = nn.Buffer(self.features.new_zeros(len(cells), 3))
-        self.finest = 2 * self.half / (self.root * 2 ** cells[-1, 0].item())  # smallest cell's side
+        self.finest = self.side[cells[-1, 0]].item()  # side of the smallest cell
         return is_old
 
     def locate(self, x):
@@ -592,9 +595,7 @@ def mixed_precision(network, x):
     """network(x), computed in bfloat16 where that pays, returned as float32. Not for distances:
     finite differences need float32."""
     device_type = x.device.type
-    if not has_bfloat16(device_type):
-        return network(x)
-    with torch.autocast(device_type, torch.bfloat16):
+    with torch.autocast(device_type, torch.bfloat16, enabled=has_bfloat16(device_type)):
         return network(x).float()
 
 
@@ -647,7 +648,7 @@ class SDFField(nn.Module):
         self.octree = octree
         self.network = mlp(3 + octree.width, hidden, 1 + GEOMETRY_FEATURES)
         last = self.network[2]
-        nn.init.normal_(last.weight[0], std=0.01)
+        nn.init.normal_(last.weight[0], std=0.01)  # the offset starts near 0
         nn.init.zeros_(last.bias)
         taps = torch.tensor(TETRAHEDRON) / 3**0.5  # (5,3), of length 1
         self.taps = nn.Buffer(taps, persistent=False)
@@ -672,7 +673,7 @@ class LipschitzLinear(nn.Linear):
     def __init__(self, inputs, outputs):
         super().__init__(inputs, outputs)
         bound = self.weight.abs().sum(1).max()
-        self.c = nn.Parameter(bound.expm1().log())
+        self.c = nn.Parameter(bound.expm1().log())  # softplus(c) is the bound: no row is scaled
 
     def bound(self):
         return F.softplus(self.c)
@@ -718,7 +719,7 @@ def composite(alpha):
     """Eq. 2: weights w_i = T_i alpha_i (R,S) with T_i = prod_{j<i} (1 - alpha_j). As a sum of logs,
     in which the transmittance of an opaque interval counts as 1e-6: the sum of w can exceed 1 by
     as much."""
-    log_pass = torch.log1p((1e-6 - 1) * alpha)  # (R,S) log transmittance of each interval
+    log_pass = torch.log1p((1e-6 - 1) * alpha)  # (R,S) log of 1 - alpha, or 1e-6
     trans = torch.exp(log_pass.cumsum(1) - log_pass)  # (R,S) T_i
     return trans * alpha
 
@@ -808,13 +809,13 @@ def contract(x):
 
 class Background(nn.Module):
     """A small NeRF beyond the sphere, on an octree over contracted space."""
-    def __init__(self, points, hidden, extra, levels, samples):
+    def __init__(self, points, hidden, per_ray, levels, samples):
         super().__init__()
         self.samples = samples
         self.octree = Octree(2.0, levels, root=32)  # cells of 1/8
         seed_octree(self.octree, contract(points), dense=levels - 3)  # points (P,3)
         self.density = mlp(3 + self.octree.width, hidden, 1 + GEOMETRY_FEATURES)
-        self.color = mlp(GEOMETRY_FEATURES + extra, hidden, 3)
+        self.color = mlp(GEOMETRY_FEATURES + per_ray, hidden, 3)
 
     def forward(self, rays, t1, per_ray, gen=None):
         """Colour (R,3) beyond t1 (R,1), and the mean position (R,3) of what is seen there, in
@@ -916,10 +917,10 @@ def gpl_loss(mask, phi):
 def mask_loss(logit, excess):
     """L_reg: binary cross entropy that classifies rays (R,) by their error. A ray whose error
     exceeds its threshold (excess > 0) is trained towards M = 1, any other towards M = 0, weighted
-    by |excess|. For a single ray the best M is that of (1 - M) error + M threshold, whose own
-    gradient vanishes where the sigmoid saturates. With L_GPL the least is at M = min(1, excess /
-    (0.05 Phi)): edges of the geometry are masked fully only if their errors exceed the threshold
-    by 0.05 and more. [D3]"""
+    by |excess|. For a single ray the best M is 1 if its error exceeds the threshold, else 0, as
+    for the simpler (1 - M) error + M threshold, whose gradient vanishes where the sigmoid
+    saturates. With L_GPL the best M is min(1, excess / (0.05 Phi)): only errors that exceed the
+    threshold by 0.05 mask an edge fully. [D3]"""
     is_transient = (excess > 0).float()
     return F.binary_cross_entropy_with_logits(logit, is_transient, excess.abs())
 
@@ -937,7 +938,7 @@ def reject_outliers(mask, is_outlier, done):
     bar. The bar rises from 0 to 1 over the first REJECTION of training; then nothing is rejected.
     So at first the scene learns from the rays below their thresholds alone. The thresholds grow
     where all rays err. Later the scene must learn its own details. [D3]"""
-    bar = (done / REJECTION) ** 2
+    bar = (done / REJECTION) ** 2  # squared: low for long
     return torch.where(is_outlier & (mask > bar), 1.0, mask)
 
 
@@ -1026,7 +1027,7 @@ class TransientMask(nn.Module):
     def logits(self, photos):
         """Transient logits (B,1,m,m) of photos (B,)."""
         y = self.thumbs[photos] / 255 - 0.5  # (B,3,2m,2m)
-        size = (y.shape[2] + 1) // 2
+        size = y.shape[2] // 2
         logits = 0
         for stage, head in zip(self.stages, self.heads):
             y = stage(y)  # (B,16,m,m), (B,32,m/2,m/2), (B,64,m/4,m/4)
@@ -1089,7 +1090,7 @@ class GeoNVS(nn.Module):
 
         octree = Octree(1.0, levels)
         seed_octree(octree, self.sfm, dense=0)
-        self.octrees = [octree]
+        self.octrees = [octree]  # a list: the fields own them
         self.sdf = SDFField(octree, cfg.hidden)
         self.color = nn.Sequential(
             LipschitzLinear(GEOMETRY_FEATURES + octree.width + 3 + 3 + A, cfg.hidden),
@@ -1220,7 +1221,7 @@ class GeoNVS(nn.Module):
         is_counted = ~rays.is_masked
         e_grad, e_curv = self.cache.errors(hits.x)  # (R,)
         if self.cfg.printed("phi"):
-            is_inside = hits.x[:, 0].norm(dim=1) < 1.001  # the cache holds nothing further out
+            is_inside = hits.x[:, 0].norm(dim=1) < 1.001  # not if a ray misses the sphere
             ray_complexity = complexity(e_grad, e_curv / self.cache.side) * is_inside
             return paper_phi(ray_complexity) * is_counted
         return edge_indicator(complexity(e_grad, e_curv), hits.opacity.detach() * is_counted)
@@ -1229,31 +1230,29 @@ class GeoNVS(nn.Module):
         """Section 6 for rays that end at places (R,3), with Phi and errors (R,). Returns left_out
         (R,), L_reg and L_GPL. L_rgb is weighted by 1 - left_out. left_out is M, or 1 for rejected
         outliers and for pixels that a user's mask excludes."""
-        left_out = torch.zeros_like(error)
-        reg = gpl = error.new_zeros(())
-        if self.has_mask:
-            with torch.set_grad_enabled(done < MASK_TRAINING):
-                logit = sample_logits(self.mask.logits(photos), rays.uv)  # (R,)
-            M = logit.sigmoid()
-            is_counted = ~rays.is_masked
-            # SfM pixels count as if they had no error: they train M = 0 [D5]
-            judged = error.masked_fill(rays.has_sfm, 0)
-            if self.cfg.printed("reg"):
-                reg = paper_mask_loss(M * is_counted, judged)
-                left_out = M.detach()
-            else:
-                excess = judged - self.usual_errors.threshold(place)
-                reg = mask_loss(logit, excess * is_counted)
-                left_out = reject_outliers(M.detach(), excess > 0, done)
-            gpl = gpl_loss(M, phi)
-        return left_out.masked_fill(rays.is_masked, 1), reg, gpl
+        if not self.has_mask:
+            return rays.is_masked.float(), *error.new_zeros(2)
+        with torch.set_grad_enabled(done < MASK_TRAINING):
+            logit = sample_logits(self.mask.logits(photos), rays.uv)  # (R,)
+        M = logit.sigmoid()
+        is_counted = ~rays.is_masked
+        # SfM pixels count as if they had no error: they train M = 0 [D5]
+        judged = error.masked_fill(rays.has_sfm, 0)
+        if self.cfg.printed("reg"):
+            reg = paper_mask_loss(M * is_counted, judged)  # with the gradient that L_rgb gives M
+            left_out = M.detach()
+        else:
+            excess = judged - self.usual_errors.threshold(place)
+            reg = mask_loss(logit, excess * is_counted)
+            left_out = reject_outliers(M.detach(), excess > 0, done)
+        return left_out.masked_fill(rays.is_masked, 1), reg, gpl_loss(M, phi)
 
     def remember(self, rays, hits, error):
         """Follows the errors (R,) of a step's rays: for the mask's threshold those of a place, for
         refinement those of the octree's cells at surface points, people's among them. [D3] [D7]"""
         self.usual_errors.update(hits.place, error, ~rays.is_masked)
         is_solid = hits.opacity > 0.5  # (R,)
-        pixel = hits.depth / self.scene.K[rays.img, 0]  # (R,) its size at the surface point
+        pixel = hits.depth / self.scene.K[rays.photo, 0]  # (R,) its size at the surface point
         counted = error.masked_fill(rays.is_masked, 0)
         columns = torch.stack([counted, pixel, torch.ones_like(pixel)], 1) * is_solid[:, None]
         octree = self.sdf.octree
@@ -1268,8 +1267,8 @@ class GeoNVS(nn.Module):
         """n random rays and the photos (B,) they come from, photo by photo."""
         photos = self.scene.train
         picked = photos[random_index(gen, len(photos), self.cfg.photos)]  # (B,)
-        img = picked.repeat_interleave(n // len(picked))  # (R,)
-        return random_rays(self.scene, img, gen), picked
+        photo = picked.repeat_interleave(n // len(picked))  # (R,)
+        return random_rays(self.scene, photo, gen), picked
 
     def groups(self):
         """Optimiser groups with their learning rates: networks, grids, codes, mask."""
@@ -1387,7 +1386,7 @@ def fingerprint(scene):
     raw = scene.raw
     count = len(raw["name"])
     # colours weigh a hundredth, as programs decode photos in slightly different ways
-    color = scene.thumbs.mean((2, 3), dtype=torch.float).cpu().numpy() / 25500  # (I,3)
+    color = scene.thumbs.mean((2, 3), dtype=torch.float).cpu().numpy() / 255 / 100  # (I,3)
     columns = [np.arange(count), raw["is_test"], raw["wh"], raw["K"], raw["c2w"], color]
     photos = np.hstack([np.reshape(column, (count, -1)) for column in columns])
     sphere = np.append(raw["center"] / raw["scale"], np.log(raw["scale"]))
@@ -1481,7 +1480,7 @@ def load_run(run, **given):
     run = Path(run).resolve()
     saved, cfg = read_checkpoint(run / "checkpoint.pt", given)
     device = pick_device(cfg.device)
-    scene = load_scene(read_scene(cfg, run.parent.parent), device)
+    scene = load_scene(find_scene(cfg, run.parent.parent), device)
     with device:
         model = GeoNVS(cfg, scene)
     _, state = restore(saved, model)
@@ -1531,15 +1530,12 @@ def train(cfg, scene, run, saved=None, processes=ALONE):
     torch.set_flush_denormal(True)  # vanishing weights would otherwise slow a CPU down
     model, optimizer, gen, state = start(cfg, scene, saved, processes)
     done = state.share_done(cfg)
-    if done >= 1:
-        model.refresh_cache()
-        return model, state
-    if saved and processes.is_first:
+    if saved and done < 1 and processes.is_first:
         remove_results(run)
         atomic_write(run / "log.jsonl", lambda part: part.write_text("".join(state.log)))
     meter = metered_joules(gen.device, state.joules, processes)
     next(meter, None)  # it counts from here
-    seconds = state.seconds
+    seconds = state.seconds  # of this process; state has those that all agree on
     next_log = 0.0
     caught = []  # signals
     is_stopped = False
@@ -1619,10 +1615,10 @@ def fit_codes(model, scene, photos, steps=128, n=64):
     if codes.numel() == 0:
         return codes
     adam = torch.optim.Adam([codes.requires_grad_()])
-    img = photos.repeat_interleave(n)  # (Bn,)
+    photo = photos.repeat_interleave(n)  # (Bn,)
     for step in progress(range(steps), "fitting codes of held-out photos"):
         adam.param_groups[0]["lr"] = 0.1 * 0.1 ** (step / steps)
-        rays = random_rays(scene, img, gen, part=0.5)
+        rays = random_rays(scene, photo, gen, part=0.5)
         rgb = model.render(rays, codes.repeat_interleave(n, 0)).rgb
         residual = (rgb - rays.rgb).abs() * ~rays.is_masked[:, None]  # (Bn,3)
         adam.zero_grad()
@@ -1952,17 +1948,12 @@ def main(argv=None):
     if processes.count > 1:
         processes.join(device)
         if processes.is_first:
-            read_scene(cfg)  # the others find it made
+            find_scene(cfg)  # the others find it made
         dist.barrier()
-    scene = load_scene(read_scene(cfg), device)
+    scene = load_scene(find_scene(cfg), device)
     model, state = train(cfg, scene, run, saved, processes)
     if processes.is_first:
-        try:
-            finish(model, scene, state, run, processes)
-        except Exception as error:
-            check(not is_memory_full(error), "the memory is full, but the training is saved: end "
-                  "other programs, then go on with --resume")
-            raise
+        finish(model, scene, state, run, processes)
     if processes.count > 1:
         dist.destroy_process_group()
 
@@ -1984,8 +1975,8 @@ def run_command_line(entry):
         except Exception as error:
             if not is_memory_full(error):
                 raise
-            message = ("the memory is full: begin anew with fewer --rays or a larger --downscale; "
-                       + go_on)
+            message = ("the memory is full: end other programs, or begin anew with fewer --rays or "
+                       "a larger --downscale; " + go_on)
     with contextlib.suppress(OSError):  # the terminal may be closed
         data_prep.warn(f"error: {message}")
     sys.exit(2)

@@ -1951,7 +1951,7 @@ def shaded(model, rays, code, hits):
 @pytest.mark.parametrize("background", ["on", "off"])
 def test_rendering_and_its_gradients_equal_plain_loops(double, background):
     model, rays, _ = rough_case(background=background)
-    code = model.appearance(rays.img)
+    code = model.appearance(rays.photo)
     gen = generator()
     t = model.sample(rays, *geonvs.sphere_interval(*rays[:3]), gen)
     part = geonvs.stratified(rays, 12, gen)
@@ -2048,7 +2048,7 @@ def test_the_model_remembers_errors_of_places_and_cells(warm):
     opacity = (index < 40).float()  # 40 of 1,000 rays end on the foreground
     hits = geonvs.Hits(None, None, None, opacity, depth, point, None, place)
     octree = warm.sdf.octree
-    pixel = depth / warm.scene.K[rays.img, 0]
+    pixel = depth / warm.scene.K[rays.photo, 0]
     counted = torch.where(rays.is_masked, 0.0, error)
     columns = torch.column_stack([counted, pixel, torch.ones(1000)])
     node, _, _ = octree.locate(point)
@@ -2079,7 +2079,7 @@ def test_batches_come_photo_by_photo_from_training_photos(warm):
     met = set()
     for _ in range(20):
         rays, photos = warm.batch(64, gen)
-        assert torch.equal(rays.img, photos.repeat_interleave(16))
+        assert torch.equal(rays.photo, photos.repeat_interleave(16))
         met.update(photos.tolist())
     assert met == {0, 1, 3, 4, 5, 7}  # the others are held out
 
@@ -2088,7 +2088,7 @@ def plain_losses(model, rays, done):
     """Terms of the objective, and what is logged beside them, by a loop over eight rays."""
     cfg = model.cfg
     gen = generator()
-    code = model.appearance(rays.img)
+    code = model.appearance(rays.photo)
     hits = model.trace(rays, code, gen)
     sfm = model.sfm[torch.randint(len(model.sfm), (2,), generator=gen)]
     air = model.air[torch.randint(len(model.air), (2,), generator=gen)]
@@ -2112,7 +2112,7 @@ def plain_losses(model, rays, done):
         residual = (rgb[r] - rays.rgb[r]).abs()
         M = 0.0
         if cfg.mask == "on":
-            photo = rays.img[r].item()
+            photo = rays.photo[r].item()
             logit, = geonvs.sample_logits(model.mask.logits([photo]), rays.uv[r])
             if done >= 0.6:
                 logit = logit.detach()
@@ -2191,9 +2191,9 @@ def test_a_facades_court_becomes_air():
     for step in range(120):
         geonvs.training_step(model, optimizer, step, step / 120, generator(step))
     rays = geonvs.random_rays(scene, scene.train.repeat_interleave(200), generator())
-    wh = scene.wh[rays.img]
+    wh = scene.wh[rays.photo]
     col, row = (rays.uv * wh).long().unbind(1)
-    pixel = scene.start[rays.img] + row * wh[:, 0] + col
+    pixel = scene.start[rays.photo] + row * wh[:, 0] + col
     wall = torch.from_numpy(scene.raw["depth"]).float()[pixel, None]
     t0, t1 = geonvs.sphere_interval(*rays[:3])
     t1 = torch.minimum(t1, wall - 0.05)
@@ -3322,7 +3322,7 @@ def test_a_trained_run_outlives_full_memory(command, monkeypatch, part):
     with monkeypatch.context() as patch:
         fail = mock.Mock(side_effect=RuntimeError("can't allocate memory"))
         patch.setattr(geonvs, part, fail)
-        assert_refused(command(FLAGS), "training is saved")
+        assert_refused(command(FLAGS), "end other programs")
     assert command("--resume --name=b") == (0, "")
     assert Path("runs/b/metrics.json").exists()
 
@@ -3491,7 +3491,7 @@ class NeRFW(Rival):
         """Coarse and fine pass with n samples and 2n, as in GeoNVS.trace. other: codes (R,16)
         of the transient head."""
         n = self.cfg.samples
-        far = self.far[rays.img, None]  # (R,1)
+        far = self.far[rays.photo, None]  # (R,1)
         t = torch.lerp(rays.near, far, geonvs.stratified(rays, n, gen))  # (R,n)
         coarse = self.pass_through(self.coarse, rays, t, code)
         weight = coarse["w"].detach() + 1e-3
@@ -3528,8 +3528,8 @@ class NeRFW(Rival):
 
     def losses(self, rays, photos, done, gen):
         """Squared error over learned variance, its log, a penalty on transients. NeRF-W Eq. 13"""
-        code = self.appearance(rays.img)
-        out = self.trace(rays, code, self.transient(rays.img), gen)
+        code = self.appearance(rays.photo)
+        out = self.trace(rays, code, self.transient(rays.photo), gen)
         error = ((out["rgb"] - rays.rgb) ** 2).sum(1)  # (R,)
         coarse = ((out["coarse"] - rays.rgb) ** 2).sum(1)
         beta = out["beta"]
@@ -3668,10 +3668,10 @@ class Splats(Rival):
         """The rays of each photo at once, under the code of the first of them. The geometry has no
         gradient here."""
         rgb = torch.zeros_like(rays.rgb)
-        for photo in rays.img.unique().tolist():
+        for photo in rays.photo.unique().tolist():
             with torch.no_grad():
                 view = self.view(photo)
-            mine = rays.img == photo  # (R,)
+            mine = rays.photo == photo  # (R,)
             xy = rays.uv[mine, None] * self.scene.wh[photo]  # (R,1,2) px, each ray a tile
             picture, _ = self.draw(view, code[mine][0], xy)
             rgb[mine] = picture[:, 0]
@@ -4097,7 +4097,7 @@ def test_nerfw_mixes_static_and_transient_as_its_equation_says(scene):
     model = rival(scene, "NeRF-W")
     rays, _ = model.batch(64, generator())
     t = torch.tensor([[1.0, 1.5, 1.7]]).repeat(64, 1)
-    code = model.codes()[rays.img]
+    code = model.codes()[rays.photo]
     other = torch.ones(64, 16)
     sigma, rgb, neck = model.fine(rays.at(t), rays.d, code)
     out = model.pass_through(model.fine, rays, t, code, other)
