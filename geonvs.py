@@ -60,6 +60,8 @@ Departures from the printed paper. The tag stands at the code; .github/RESULTS.m
   [D7]  octrees are pruned             cells split where colours err;    cells that are never made
                                        what a scene does not need is     need no pruning
                                        off
+  [D8]  zeta is learned                above a bound that rises          else surfaces stay soft
+                                                                         where photos are few
 """
 import argparse
 import contextlib
@@ -106,7 +108,7 @@ def setting(default, meaning, **limits):
 SCENES = ("toy", *data_prep.SCENES)
 DEVICES = ("auto", "cpu", "cuda")
 SWITCH = ("auto", "on", "off")
-PRINTED = ("alpha", "phi", "reg")  # equations that --paper can choose
+PRINTED = ("alpha", "phi", "reg", "zeta")  # equations that --paper can choose
 GROUPS = dict(  # titles in --help, by the first setting of each group
     scene="what", steps="how long", rays="model", lam_eik="loss weights", lr_grid="learning rates")
 
@@ -224,6 +226,7 @@ ALONE = Processes()
 # when things happen, in shares of training
 REFINE_AT = (0.1, 0.2, 0.3, 0.45, 0.6)  # the octree is refined; later there is no time to fit it
 REJECTION = 0.3  # outliers are rejected until then, while the mask does not know them yet
+ZETA_RISE = 0.4  # surfaces may be soft until then: the least zeta rises
 MASK_TRAINING = 0.6  # M is fixed from then on, as errors of memorised people are small
 
 
@@ -595,7 +598,9 @@ def mixed_precision(network, x):
     """network(x), computed in bfloat16 where that pays, returned as float32. Not for distances:
     finite differences need float32."""
     device_type = x.device.type
-    with torch.autocast(device_type, torch.bfloat16, enabled=has_bfloat16(device_type)):
+    if not has_bfloat16(device_type):
+        return network(x)
+    with torch.autocast(device_type, torch.bfloat16):
         return network(x).float()
 
 
@@ -1038,6 +1043,7 @@ class TransientMask(nn.Module):
 # ---- 7 The model and its objective ---------------------------------------------------------------
 
 START_ZETA = 20  # a surface is 1/20 of a radius wide
+LEAST_ZETA = 80  # from ZETA_RISE of training on
 MAX_PULL = 40  # zeta up to which L_sfm and L_off grow stronger
 CACHE_EVERY = 128  # steps between renewals of the cache
 
@@ -1126,6 +1132,14 @@ class GeoNVS(nn.Module):
         """The deviation network: one learned number v, zeta = exp(10 v), clipped as in NeuS's code;
         1 / zeta is the width of a surface."""
         return torch.exp((10 * self.deviation).clamp(-13.8, 13.8))
+
+    def raise_zeta(self, done):
+        """Keeps zeta above a bound that rises with training (done: 0..1). A soft surface can paint
+        people and clouds of a single photo. Their errors are then small, so the mask misses them,
+        and the surface stays soft. [D8]"""
+        if not self.cfg.printed("zeta"):
+            least = LEAST_ZETA * min(done / ZETA_RISE, 1) + 1e-6
+            self.deviation.data.clamp_min_(math.log(least) / 10)
 
     def alpha(self, sdf, max_zeta=math.inf):
         """Opacity (R,S) of the intervals between samples with SDF (R,S+1). Eq. 1"""
@@ -1367,6 +1381,7 @@ def training_step(model, optimizer, step, done, gen, processes=ALONE):
     device."""
     if step % CACHE_EVERY == 0:
         model.refresh_cache()
+    model.raise_zeta(done)
     rays, picked = model.batch(model.cfg.rays, gen)
     loss, terms = model.losses(rays, picked, done, gen)
     optimizer.zero_grad()

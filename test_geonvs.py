@@ -2266,6 +2266,15 @@ def test_zeta_is_learned_within_what_floats_hold(warm, v, zeta):
     assert warm.zeta().item() == pytest.approx(zeta, 1e-5)
 
 
+@pytest.mark.parametrize("done, least", [(0.0, 1e-6), (0.1, 20), (0.2, 40), (0.4, 80), (1.0, 80)])
+def test_the_least_zeta_rises_and_paper_has_none(warm, done, least):
+    for printed, zeta in itertools.product((False, True), (1.0, 30.0, 300.0)):
+        warm.cfg.paper = "zeta" if printed else ""
+        warm.deviation.data.fill_(math.log(zeta) / 10)
+        warm.raise_zeta(done)
+        assert warm.zeta().item() == pytest.approx(zeta if printed else max(zeta, least), 1e-4)
+
+
 def test_a_step_renews_the_cache_now_and_then(warm, monkeypatch):
     renewed = []
     monkeypatch.setattr(warm, "refresh_cache", lambda: renewed.append(step))
@@ -3422,7 +3431,7 @@ class Rival(nn.Module):
     def do_nothing(self, *_):
         pass
 
-    refresh_cache = refine = do_nothing
+    refresh_cache = raise_zeta = refine = do_nothing
 
 
 def layers(*sizes):
