@@ -813,7 +813,7 @@ def contract(x):
 
 
 class Background(nn.Module):
-    """A small NeRF beyond the sphere, on an octree over contracted space."""
+    """A small NeRF before and beyond the sphere, on an octree over contracted space."""
     def __init__(self, points, hidden, per_ray, levels, samples):
         super().__init__()
         self.samples = samples
@@ -822,23 +822,30 @@ class Background(nn.Module):
         self.density = mlp(3 + self.octree.width, hidden, 1 + GEOMETRY_FEATURES)
         self.color = mlp(GEOMETRY_FEATURES + per_ray, hidden, 3)
 
-    def forward(self, rays, t1, per_ray, gen=None):
-        """Colour (R,3) beyond t1 (R,1), and the mean position (R,3) of what is seen there, in
-        contracted space, without gradient. per_ray: (R,3+A) direction and code. A sample lies
-        u / (1 - u) behind t1, where u is stratified. The last one is opaque."""
-        u = stratified(rays, self.samples, gen)  # (R,S)
-        distance = u / (1 - u).clamp_min(1e-3)  # (R,S) at most 1,000 radii
-        x = contract(rays.at(t1 + distance))  # (R,S,3)
+    def forward(self, rays, t0, t1, per_ray, gen=None):
+        """What lies around the sphere, which rays enter at t0 (R,1) and leave at t1. per_ray:
+        (R,3+A) direction and code. Returns the colour (R,3) of what lies before t0, the share (R,1)
+        of light that passes it, the colour (R,3) beyond t1, dimmed by what lies before t0, and the
+        mean position (R,3) there, in contracted space, without gradient. The first sixth of the
+        samples is stratified up to t0. The others lie u / (1 - u) behind t1, where u is stratified.
+        The last one is opaque."""
+        n = self.samples // 6
+        before = rays.near.lerp(t0, stratified(rays, n, gen))  # (R,n)
+        u = stratified(rays, self.samples - n, gen)  # (R,S-n)
+        beyond = u / (1 - u).clamp_min(1e-3)  # (R,S-n) at most 1,000 radii
+        length = torch.cat([torch.cat([before, t0], 1).diff(), beyond.diff()], 1)  # (R,S-1)
+        x = contract(rays.at(torch.cat([before, t1 + beyond], 1)))  # (R,S,3)
         inputs = torch.cat([x, self.octree(x)], 2)  # (R,S,3+LC)
         out = mixed_precision(self.density, inputs)  # (R,S,1+GEOMETRY_FEATURES)
         sigma, geo = out.split([1, GEOMETRY_FEATURES], 2)
         sigma = F.softplus(sigma[..., 0] - 1)  # (R,S) starts at 0.31
-        alpha = 1 - torch.exp(-sigma[:, :-1] * distance.diff())  # (R,S-1)
+        alpha = 1 - torch.exp(-sigma[:, :-1] * length)  # (R,S-1)
         w = composite(F.pad(alpha, (0, 1), value=1.0))  # (R,S)
-        rgb = colors_of(self.color, geo, per_ray)  # (R,S,3)
-        color = torch.einsum("rs,rsc->rc", w, rgb)
-        place = torch.einsum("rs,rsc->rc", F.normalize(w.detach(), p=1, dim=1), x)
-        return color, place
+        colors = w[..., None] * colors_of(self.color, geo, per_ray)  # (R,S,3)
+        passed = 1 - w[:, :n].sum(1, keepdim=True)  # (R,1)
+        w_beyond = F.normalize(w[:, n:].detach(), p=1, dim=1)
+        place = torch.einsum("rs,rsc->rc", w_beyond, x[:, n:])
+        return colors[:, :n].sum(1), passed, colors[:, n:].sum(1), place
 
 
 def surface_depth(t, sdf, w):
@@ -859,11 +866,11 @@ class Hits(NamedTuple):
     """What rays meet, indexed by the ray. depth, point and place have no gradient."""
     x: Tensor  # (R,S+1,3) samples in the sphere
     geo: Tensor  # (R,S+1,G) inputs of the colour network there
-    w: Tensor  # (R,S+1) their weights
+    w: Tensor  # (R,S+1) their weights, dimmed by what lies before the sphere
     opacity: Tensor  # (R,) of the foreground
     depth: Tensor  # (R,) distance to the surface; t1 if none is met
     point: Tensor  # (R,3) the surface point
-    bg_color: Tensor  # (R,3) of what lies beyond the sphere
+    around: Tensor  # (R,3) colour of what lies before and beyond the sphere, as it is seen
     # (R,3) where the ray ends, in contracted space: the surface point if the foreground is solid,
     # else the mean position of the background
     place: Tensor
@@ -1174,21 +1181,23 @@ class GeoNVS(nn.Module):
         # the sample at either end [D1]
         w = F.avg_pool1d(interval_w, 2, stride=1, padding=1)  # (R,S+1)
 
-        bg_color = self.bg_color.expand_as(rays.d)  # (R,3)
+        beyond = self.bg_color  # (3,)
         bg_place = 2 * rays.d  # (R,3) infinity
+        before = 0
         if self.background:
             per_ray = torch.cat([rays.d, code], 1)  # (R,3+A)
-            bg_color, bg_place = self.background(rays, t1, per_ray, gen)
+            before, passed, beyond, bg_place = self.background(rays, t0, t1, per_ray, gen)
+            w = passed * w
+        around = before + (1 - opacity[:, None]) * beyond  # (R,3)
         place = torch.where(opacity[:, None] > 0.5, point, bg_place)
-        return Hits(x, geo, w, opacity, depth, point, bg_color, place)
+        return Hits(x, geo, w, opacity, depth, point, around, place)
 
     def shade(self, rays, code, hits, normal):
         """Colours (R,3) of rays with hits and normals (R,3) at their surface points. All samples of
         a ray share its normal, which is no input in the paper. [D6]"""
         per_ray = torch.cat([normal, rays.d, code], 1)  # (R,3+3+A)
         rgb = colors_of(self.color, hits.geo, per_ray)  # (R,S+1,3)
-        rgb = torch.einsum("rs,rsc->rc", hits.w, rgb)  # (R,3)
-        return rgb + (1 - hits.opacity[:, None]) * hits.bg_color
+        return torch.einsum("rs,rsc->rc", hits.w, rgb) + hits.around
 
     def losses(self, rays, photos, done, gen):
         """The objective of rays that come photo by photo, equally many of each of photos (B,);

@@ -1859,21 +1859,26 @@ def plain_errors(model, x):
     return torch.tensor(np.concatenate(found))
 
 
-def plain_background(model, o, d, t1, per_ray, part):
-    """Colour and place of one ray beyond the sphere, sample by sample. part: (S,) stratified."""
+def plain_background(model, o, d, t0, t1, near, per_ray, parts):
+    """What GeoNVS.background returns for one ray, sample by sample. parts: stratified numbers, (n,)
+    for samples before the sphere and (S-n,) for those beyond it."""
+    n = len(parts[0])
+    places = [near + u * (t0 - near) for u in parts[0]] + [t1 + u / (1 - u) for u in parts[1]]
     samples = []
-    for u in part:
-        t = t1 + u / (1 - u)
+    for t in places:
         x = o + t * d
         length = max(x.norm(), 1)
         x = x * (2 - 1 / length) / length
         out = model.background.density(torch.cat([x, model.plain[1](x)]))
         color = model.background.color(torch.cat([out[1:], per_ray]))
-        samples.append((t, x, F.softplus(out[0] - 1), color.sigmoid()))
-    t, x, sigma, color = map(torch.stack, zip(*samples))
-    alphas = 1 - torch.exp(-sigma[:-1] * t.diff())
+        samples.append((x, F.softplus(out[0] - 1), color.sigmoid()))
+    x, sigma, color = map(torch.stack, zip(*samples))
+    ends = [*places[1:n], t0, *places[n + 1:]]  # of the intervals but the last
+    starts = places[:-1]
+    alphas = [1 - torch.exp(-s * (b - a)) for s, a, b in zip(sigma[:-1], starts, ends)]
     w = plain_weights([*alphas, 1])
-    return w @ color, w.detach() @ x / w.detach().sum()
+    far = w[n:].detach()
+    return w[:n] @ color[:n], 1 - w[:n].sum(), w[n:] @ color[n:], far @ x[n:] / far.sum()
 
 
 def plain_derivatives(model, x):
@@ -1884,7 +1889,7 @@ def plain_derivatives(model, x):
     return s[0], grad, s[1:].mean() - s[0]
 
 
-def plain_render(model, o, d, t, code, part):
+def plain_render(model, o, d, near, t, code, *parts):
     """What trace and shade return for one ray, in one row, sample by sample."""
     zeta = torch.exp(10 * model.deviation)
     samples = [plain_sdf(model, o + distance * d) for distance in t]
@@ -1910,11 +1915,11 @@ def plain_render(model, o, d, t, code, part):
     colors = [plain_color(model, torch.cat([geo, normal, per_ray])) for _, geo in samples]
     colors = torch.stack(colors)
     rgb = w @ (colors[:-1] + colors[1:]) / 2
-    bg_color = model.bg_color
-    bg_place = 2 * d
+    before, passed, beyond, bg_place = 0, 1, model.bg_color, 2 * d
     if model.background:
-        bg_color, bg_place = plain_background(model, o, d, t[-1], per_ray, part)
-    rgb = rgb + (1 - opacity) * bg_color
+        before, passed, beyond, bg_place = plain_background(
+            model, o, d, t[0], t[-1], near, per_ray, parts)
+    rgb = before + passed * rgb + (1 - opacity) * beyond
     place = point if opacity > 0.5 else bg_place
     return torch.hstack([rgb, opacity, depth, normal, point, place])
 
@@ -1954,8 +1959,8 @@ def test_rendering_and_its_gradients_equal_plain_loops(double, background):
     code = model.appearance(rays.photo)
     gen = generator()
     t = model.sample(rays, *geonvs.sphere_interval(*rays[:3]), gen)
-    part = geonvs.stratified(rays, 12, gen)
-    rows = zip(rays.o, rays.d, t, code, part)
+    before, beyond = [geonvs.stratified(rays, n, gen) for n in (2, 10)]
+    rows = zip(rays.o, rays.d, rays.near[:, 0], t, code, before, beyond)
     wanted = [plain_render(model, *row) for row in rows]
     hits = model.trace(rays, code, generator())
     rgb, normal = shaded(model, rays, code, hits)
