@@ -11,8 +11,8 @@ follow one ray from its pixel to the loss; the training loop comes after them.
     torchrun --nproc_per_node 4 geonvs.py  on 4 GPUs, each with rays of its own
     python geonvs.py --help                every setting with its meaning and default
 
-The paper's equations. `--paper` trains with the forms in the last column; all other departures
-stay.
+The paper's equations. `--paper` trains with the forms in the last column and a free zeta; all
+other departures stay.
   Eq. 1  opacity of an interval     neus_alpha                                 paper_alpha
   Eq. 2  compositing weights        composite
   Eq. 3  geometry preservation      gpl_loss
@@ -52,10 +52,10 @@ Departures from the printed paper. The tag stands at the code; .github/RESULTS.m
   [D5]  a sphere loss in a warm-up     SfM points place the sphere and   else part of the first ball
                                        seed the octree; s and M are 0    stays before a facade
                                        there; lines of sight are air
-  [D6]  derivatives at every sample;   at one surface point per ray, at  each is five lookups; the
-        no normal as an input          SfM points and in air; colours    normal is worth half a
-                                       see the normal; samples and Phi   decibel on two of three
-                                       read a cached SDF, so L_GPL       sets of photos
+  [D6]  derivatives at every sample;   at one surface point per ray, at  each is five lookups;
+        no normal as an input          SfM points and in air; colours    light depends on the
+                                       see the normal; samples and Phi   normal
+                                       read a cached SDF, so L_GPL
                                        moves M alone
   [D7]  octrees are pruned             cells split where colours err;    cells that are never made
                                        what a scene does not need is     need no pruning
@@ -922,7 +922,8 @@ def paper_phi(ray_complexity):
 
 def gpl_loss(mask, phi):
     """L_GPL, Eq. 3: the mean of M(r) Phi(r); the mask must not erase edges of the structure. Phi
-    has no gradient: the loss moves the mask, never the SDF. [D6]"""
+    has no gradient: the loss moves the mask, never the SDF. At the paper's weight no effect was
+    measured here. [D6]"""
     return (mask * phi).mean()
 
 
