@@ -138,6 +138,30 @@ def is_memory_full(error):
     return isinstance(error, MemoryError)
 
 
+def run_command_line(entry, go_on="start again"):
+    """Exit code 0, or 2 with one sentence on stderr; a bug keeps its traceback. go_on: what to do
+    after a stop."""
+    allow_any_character()
+    with on_signals(signal.default_int_handler):
+        try:
+            entry()
+            return
+        except UserError as error:
+            message = str(error)
+        except OSError as error:  # a full disk, a folder without permission
+            message = f"{error}: make room, or choose another place or --name; {go_on}"
+        except KeyboardInterrupt as stop:
+            message = str(stop) or f"stopped; {go_on}"
+        except Exception as error:
+            if not is_memory_full(error):
+                raise
+            message = ("the memory is full: end other programs, or begin anew with fewer --rays or "
+                       f"a larger --downscale; {go_on}")
+    with contextlib.suppress(OSError):  # the terminal may be closed
+        warn(f"error: {message}")
+    sys.exit(2)
+
+
 def progress(items, what):
     """Yields items and prints progress: after 10 s every second, in a log file every minute."""
     wait = 1 if sys.stdout.isatty() else 60  # seconds
@@ -750,7 +774,8 @@ def fingerprint(info):
     photos = photo_files(images, info["posed"])
     paths += [photos[name] for name in sorted(match_names(info["posed"], photos).values())]
     for masks in mask_folders(images):
-        paths += files_below(masks)
+        if masks.name.lower() == "masks":  # others are named, not read
+            paths += files_below(masks)
     return checksum(paths)
 
 
@@ -1557,7 +1582,7 @@ def sfm_photos(images):
 
 def write_sfm_masks(files, masks, folder):
     """Writes masks in the photos' sizes under COLMAP's names, photo.jpg.png, white ones for photos
-    without: COLMAP 4 wants one for each photo or none at all. Returns whether any pixel is black."""
+    without: COLMAP 4 wants one for each photo or none. Returns whether any pixel is left out."""
     is_needed = False
     for name, path in progress(files.items(), "looking for masks"):
         try:
@@ -1632,27 +1657,20 @@ def main(argv=None):
         if isinstance(knob.default, bool):
             options = {"action": argparse.BooleanOptionalAction}
         add(f"--{key}", help=f"toy, default {knob.default}", **options)
-    allow_any_character()
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C
     given = vars(parser.parse_args(argv))
     name, is_download, is_sfm = [given.pop(key, None) for key in ("scene", "download", "sfm")]
     path = scene_path(name)
     allowed = knobs if name == "toy" else ("downscale", "split")
     wrong = given.keys() - allowed
-    try:
-        check(not wrong, f"--{' --'.join(wrong)}: not for {name}")
-        if is_download:
-            download(name)
-        if is_sfm:
-            run_sfm(Path(name))
-        scene = make_toy(**given) if name == "toy" else prepare(name, **given)
-        write_scene(path, scene)
-    except (UserError, OSError, MemoryError, KeyboardInterrupt) as e:
-        reason = "the memory is full" if is_memory_full(e) else "stopped; start again"
-        warn(f"error: {str(e) or reason}")
-        sys.exit(2)
+    check(not wrong, f"--{' --'.join(wrong)}: not for {name}")
+    if is_download:
+        download(name)
+    if is_sfm:
+        run_sfm(Path(name))
+    scene = make_toy(**given) if name == "toy" else prepare(name, **given)
+    write_scene(path, scene)
     print(f"{path}: {len(scene['wh'])} photos, {scene['is_test'].sum()} of them for testing")
 
 
 if __name__ == "__main__":
-    main()
+    run_command_line(main)

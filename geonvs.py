@@ -71,7 +71,6 @@ import json
 import math
 import os
 import shutil
-import signal
 import subprocess
 import sys
 import tempfile
@@ -91,7 +90,8 @@ from torch import Tensor, nn
 
 import data_prep
 from data_prep import (
-    UserError, atomic_write, check, is_memory_full, on_signals, progress, write_ply, write_png)
+    UserError, atomic_write, check, is_memory_full, on_signals, progress, run_command_line,
+    write_ply, write_png)
 
 # distances need float32: TF32 would drown finite differences in rounding errors
 torch.set_float32_matmul_precision("highest")
@@ -180,8 +180,9 @@ GPU_DEFAULTS = dict(steps=75_000, rays=16_384, photos=16, samples=32, appearance
 class Processes:
     """The processes that torchrun started, or this one alone. Each process draws its own rays and
     keeps its own error quantiles (UsualErrors). Gradients are averaged, so all hold the same
-    weights. The first process decides, prints and saves. A run of one process resumes bit for
-    bit, a run of several does not."""
+    weights. The first process decides, prints and saves. One process on a CPU resumes bit for
+    bit. A GPU adds floats in any order, and of several processes only the first keeps its random
+    numbers."""
     count: int = 1
     rank: int = 0
     local_rank: int = 0  # on this machine: the number of the process's GPU
@@ -191,7 +192,7 @@ class Processes:
         return self.rank == 0
 
     def join(self, device):
-        """Connects this process with the others; those are silent."""
+        """Connects this process with the others. All but the first stop printing."""
         check("MASTER_ADDR" in os.environ, "start processes by torchrun, or unset WORLD_SIZE")
         if device.type == "cuda":
             torch.cuda.set_device(device)
@@ -462,7 +463,7 @@ class Octree(nn.Module):
         """Splits cells (N,4), and those of their neighbours that differ along at most `reach` axes:
         1 means the six that share a face, 3 all 26. Cells of the last level are not split, nor
         neighbours that do not exist (an index of -1 has no cell's key). Returns what build does.
-        The function stays as it is, because new features are zero."""
+        The field keeps its values, because new features are zero."""
         offsets = grid_index(3, cells.device) - 1  # (27,3)
         offsets = offsets[offsets.abs().sum(1) <= reach]
         cells = (cells[:, None] + F.pad(offsets, (1, 0))).flatten(0, 1)
@@ -567,8 +568,8 @@ def seed_octree(octree, points, dense):
 
 def cells_to_split(octree):
     """Cells (N,4) to split: those with the largest summed errors, until they hold SPLIT_SHARE of
-    it. A cell is split only if its children are larger than a pixel. Errors are recorded in cells
-    that are not split. [D7]"""
+    all errors. A cell is split only if its children are larger than a pixel. Errors are recorded in
+    cells that are not split. [D7]"""
     level = octree.cells[:, 0]  # (N,)
     error, pixel, count = octree.cell_error.T  # (N,) sums over rays
     is_coarse = pixel < count * octree.side[level] / 2  # mean size of a pixel under a child's side
@@ -1125,7 +1126,7 @@ class GeoNVS(nn.Module):
                 scene.points[~is_inside], cfg.hidden, 3 + A, bg_levels, cfg.bg_samples)
             self.octrees.append(self.background.octree)
         self.deviation = nn.Parameter(torch.tensor(math.log(START_ZETA) / 10))
-        self.mask = TransientMask(scene.thumbs)
+        self.mask = TransientMask(scene.thumbs) if self.has_mask else None
         self.usual_errors = UsualErrors()
         self.cache = SDFCache(64 if levels < 4 else 128)  # as fine as the octree, within bounds
         self.refresh_cache()
@@ -1299,7 +1300,7 @@ class GeoNVS(nn.Module):
         cfg = self.cfg
         grids = [octree.features for octree in self.octrees]
         codes = [self.appearance.weight]
-        mask = list(self.mask.parameters())
+        mask = list(self.mask.parameters()) if self.has_mask else []
         special = set(grids + codes + mask)
         networks = [p for p in self.parameters() if p not in special]
         return [
@@ -1406,15 +1407,20 @@ def training_step(model, optimizer, step, done, gen, processes=ALONE):
 
 
 def fingerprint(scene):
-    """What weights depend on: each photo's place in the list, split, size, camera and mean colour,
-    by its name, and the sphere."""
+    """What weights depend on: each photo's place in the list, split, size, camera, mean colour,
+    masked share and number of sightings, by its name; the sphere, and the middle of SfM points."""
     raw = scene.raw
     count = len(raw["name"])
+    masked = raw.get("masked", np.zeros(len(raw["rgb"]), bool))
+    masked_share = [part.mean() for part in np.split(masked, raw["start"][1:-1])]
+    sightings = np.bincount(raw["track_photo"], minlength=count)
     # colours weigh a hundredth, as programs decode photos in slightly different ways
     color = scene.thumbs.mean((2, 3), dtype=torch.float).cpu().numpy() / 255 / 100  # (I,3)
-    columns = [np.arange(count), raw["is_test"], raw["wh"], raw["K"], raw["c2w"], color]
+    columns = [
+        np.arange(count), raw["is_test"], raw["wh"], raw["K"], raw["c2w"], color, masked_share,
+        sightings]
     photos = np.hstack([np.reshape(column, (count, -1)) for column in columns])
-    sphere = np.append(raw["center"] / raw["scale"], np.log(raw["scale"]))
+    sphere = np.hstack([raw["center"] / raw["scale"], np.log(raw["scale"]), raw["points"].mean(0)])
     rows = [row.tolist() for row in (*photos, sphere)]
     return dict(zip([*raw["name"].tolist(), "the sphere"], rows))
 
@@ -1479,8 +1485,8 @@ def read_checkpoint(path, given):
 
 
 def restore(saved, model, gen=None):
-    """Puts a checkpoint's weights into a model, and its random numbers into gen, if given, of the
-    same kind of device. Returns its optimiser and State."""
+    """Puts a checkpoint's weights into a model. If gen is given, it goes on with the saved random
+    numbers; its kind of device must be the same. Returns optimiser and State."""
     with as_user_error("checkpoint.pt does not fit settings or kind of device",
                       "use those it was made with"):
         changed = changes(saved["scene"], fingerprint(model.scene))
@@ -1878,7 +1884,7 @@ def finish(model, scene, state, run, processes=ALONE):
         device=torch.cuda.get_device_name() if is_cuda else threads,
         train_seconds=state.seconds,
         energy_wh=state.joules / 3600 if is_metered else None,
-        energy_source=f"the device's counter, read every {LOG_EVERY} s" if is_metered else None,
+        energy_source="the device's counter, in pauses, too" if is_metered else None,
         rays_per_second=processes.count * cfg.rays * state.step / state.seconds,
         parameters=sum(p.numel() for p in model.parameters()),
         model_bytes=sum(tensor.nbytes for tensor in [*model.parameters(), *buffers]),
@@ -1983,29 +1989,5 @@ def main(argv=None):
         dist.destroy_process_group()
 
 
-def run_command_line(entry):
-    """Exit code 0, or 2 with one sentence on stderr; a bug keeps its traceback."""
-    data_prep.allow_any_character()
-    go_on = "a run that has a checkpoint goes on with --resume"
-    with on_signals(signal.default_int_handler):
-        try:
-            entry()
-            return
-        except UserError as error:
-            message = str(error)
-        except OSError as error:  # a full disk, a folder without permission
-            message = f"{error}: make room, or choose another place or --name; {go_on}"
-        except KeyboardInterrupt as stop:
-            message = str(stop) or f"stopped; {go_on}"
-        except Exception as error:
-            if not is_memory_full(error):
-                raise
-            message = ("the memory is full: end other programs, or begin anew with fewer --rays or "
-                       "a larger --downscale; " + go_on)
-    with contextlib.suppress(OSError):  # the terminal may be closed
-        data_prep.warn(f"error: {message}")
-    sys.exit(2)
-
-
 if __name__ == "__main__":
-    run_command_line(main)
+    run_command_line(main, go_on="a run that has a checkpoint goes on with --resume")

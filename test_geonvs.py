@@ -139,7 +139,7 @@ def run_main(command):
     out, err = io.StringIO(), io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         try:
-            data_prep.main(command.split())
+            data_prep.run_command_line(lambda: data_prep.main(command.split()))
         except SystemExit as e:
             code = e.code
     return code, out.getvalue(), err.getvalue()
@@ -3489,7 +3489,7 @@ class NeRFW(Rival):
         octaves = int(1 + math.log2(math.pi / scene.raw["footprint"]))  # the last has two pixels
         self.coarse = RadianceField(cfg.hidden, self.code_dim, octaves)
         self.fine = RadianceField(cfg.hidden, self.code_dim, octaves)
-        reach = torch.cdist(scene.c2w[:, :, 3], scene.points[::20])  # (I,K/20)
+        reach = torch.cdist(scene.c2w[:, :, 3], scene.points[::20])  # (I,Q/20)
         self.far = nn.Buffer(reach.quantile(0.95, dim=1))  # (I,) the farthest points are wild
         self.appearance = nn.Embedding(len(scene.wh), self.code_dim)
         self.transient = nn.Embedding(len(scene.wh), 16)
