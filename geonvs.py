@@ -1909,6 +1909,9 @@ def finish(model, scene, state, run, processes=ALONE):
 
 # ---- 11 Command line -----------------------------------------------------------------------------
 
+GO_ON = "a run that has a checkpoint goes on with --resume"
+
+
 def make_parser():
     parser = argparse.ArgumentParser(
         description=__doc__.splitlines()[0],
@@ -1990,4 +1993,4 @@ def main(argv=None):
 
 
 if __name__ == "__main__":
-    run_command_line(main, go_on="a run that has a checkpoint goes on with --resume")
+    run_command_line(main, GO_ON)

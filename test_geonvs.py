@@ -1511,6 +1511,50 @@ def gradients(model, value):
     return dict(zip(names, grads))
 
 
+# ---- 1 settings ----------------------------------------------------------------------------------
+
+@pytest.mark.parametrize("name, least", [
+    ("steps", 1), ("downscale", 1), ("rays", 2), ("photos", 1), ("samples", 3),
+    ("bg_samples", 2), ("hidden", 1), ("lam_gpl", 0)])
+def test_a_setting_has_a_least_value(name, least):
+    geonvs.Config(**{name: least})
+    for value in (least - 1, 2**31, math.nan):
+        with pytest.raises(UserError, match=f"--{name}"):
+            geonvs.Config(**{name: value})
+
+
+@pytest.mark.parametrize("name, value", [
+    ("scene", "tower"), ("device", "tpu"), ("levels", 9), ("mask", "maybe"),
+    ("paper", "alpha,beta"), ("paper", "alpha reg")])
+def test_a_choice_is_one_of_those_that_are_named(name, value):
+    with pytest.raises(UserError, match=f"--{name} {value} is unknown: use .*,"):
+        geonvs.Config(**{name: value})
+
+
+@cases(
+    "flags, names",
+    none=([], []),
+    all=(["--paper"], list(geonvs.PRINTED)),
+    some=(["--paper", "alpha,reg"], ["alpha", "reg"]))
+def test_paper_chooses_printed_equations(flags, names):
+    given = geonvs.make_parser().parse_args(flags)
+    cfg = geonvs.Config(paper=getattr(given, "paper", ""))
+    assert [name for name in geonvs.PRINTED if cfg.printed(name)] == names
+
+
+@cases(
+    "given, gpus, source, base",
+    toy=({}, 1, "toy", {}),
+    folder=(dict(data="toy"), 1, os.path.realpath("toy"), geonvs.GPU_DEFAULTS),
+    flag=(dict(scene="taj", steps=9), 1, "taj", geonvs.GPU_DEFAULTS),
+    cpu=(dict(scene="taj"), 0, "taj", {}))
+def test_photos_on_a_gpu_have_other_defaults(monkeypatch, given, gpus, source, base):
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: gpus)
+    cfg = geonvs.make_config(given)
+    assert cfg == geonvs.Config(**base | given)
+    assert cfg.source == source
+
+
 # ---- 2 scene file and rays -----------------------------------------------------------------------
 
 @pytest.fixture(scope="module")
@@ -2378,50 +2422,6 @@ def test_the_stand_in_gpu_catches_planted_faults(warm, monkeypatch, fault):
         train_on_meta(warm, monkeypatch)
 
 
-# ---- 1 settings ----------------------------------------------------------------------------------
-
-@pytest.mark.parametrize("name, least", [
-    ("steps", 1), ("downscale", 1), ("rays", 2), ("photos", 1), ("samples", 3),
-    ("bg_samples", 2), ("hidden", 1), ("lam_gpl", 0)])
-def test_a_setting_has_a_least_value(name, least):
-    geonvs.Config(**{name: least})
-    for value in (least - 1, 2**31, math.nan):
-        with pytest.raises(UserError, match=f"--{name}"):
-            geonvs.Config(**{name: value})
-
-
-@pytest.mark.parametrize("name, value", [
-    ("scene", "tower"), ("device", "tpu"), ("levels", 9), ("mask", "maybe"),
-    ("paper", "alpha,beta"), ("paper", "alpha reg")])
-def test_a_choice_is_one_of_those_that_are_named(name, value):
-    with pytest.raises(UserError, match=f"--{name} {value} is unknown: use .*,"):
-        geonvs.Config(**{name: value})
-
-
-@cases(
-    "flags, names",
-    none=([], []),
-    all=(["--paper"], list(geonvs.PRINTED)),
-    some=(["--paper", "alpha,reg"], ["alpha", "reg"]))
-def test_paper_chooses_printed_equations(flags, names):
-    given = geonvs.make_parser().parse_args(flags)
-    cfg = geonvs.Config(paper=getattr(given, "paper", ""))
-    assert [name for name in geonvs.PRINTED if cfg.printed(name)] == names
-
-
-@cases(
-    "given, gpus, source, base",
-    toy=({}, 1, "toy", {}),
-    folder=(dict(data="toy"), 1, os.path.realpath("toy"), geonvs.GPU_DEFAULTS),
-    flag=(dict(scene="taj", steps=9), 1, "taj", geonvs.GPU_DEFAULTS),
-    cpu=(dict(scene="taj"), 0, "taj", {}))
-def test_photos_on_a_gpu_have_other_defaults(monkeypatch, given, gpus, source, base):
-    monkeypatch.setattr(torch.cuda, "device_count", lambda: gpus)
-    cfg = geonvs.make_config(given)
-    assert cfg == geonvs.Config(**base | given)
-    assert cfg.source == source
-
-
 # ---- 8 energy ------------------------------------------------------------------------------------
 
 CPU = torch.device("cpu")
@@ -2507,6 +2507,7 @@ def test_adams_first_step_equals_its_closed_form(warm, step, done, share):
     if step % 128 == 0:
         twin.refresh_cache()
     gen = generator()
+    twin.raise_zeta(done)
     rays, photos = twin.batch(64, gen)
     total, _ = twin.losses(rays, photos, done, gen)
     wanted = twin.state_dict()
@@ -3201,7 +3202,7 @@ def command(finished, tmp_path, monkeypatch, capsys):
     def run(flags):
         code = 0
         try:
-            geonvs.run_command_line(lambda: geonvs.main(flags.split()))
+            geonvs.run_command_line(lambda: geonvs.main(flags.split()), geonvs.GO_ON)
         except SystemExit as end:
             code = end.code
         return code, capsys.readouterr().err
