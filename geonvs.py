@@ -31,7 +31,7 @@ Conventions
   mask      M = 1 means transient (person, car), M = 0 means static scene
   symbols   s signed distance; zeta sharpness of the surface (1 / zeta is its width); eps step of
             finite differences; lap Laplacian; E_grad = (|grad s| - 1)^2; E_curv = |lap s| h,
-            h the step of the difference [D2]
+            h is eps in L_curv, a voxel's side in Phi [D2]
   shapes    R rays, S intervals of a ray (S + 1 samples), J intervals or points on a ray, P points,
             N octree cells, L octree levels, C channels per level, V feature rows, G inputs of the
             colour network from geometry, A appearance dims, I photos in all, B of them in a batch,
@@ -44,13 +44,13 @@ Departures from the printed paper. The tag stands at the code; .github/RESULTS.m
   [D2]  E_curv = |lap s|; Phi on       |lap s| h, h being the step of    |lap s| grows as h shrinks;
         every ray                      the difference; L_eik, L_curv,    rays through air have no
                                        Phi are weighted by opacity       edges
-  [D3]  L_reg: intensity and           M classifies rays by their error  printed, M takes skies;
-        bimodality of M, which L_rgb   at a place; early outliers are    errors of memorised people
-        trains, too                    rejected; M is fixed at 60 %      are small
+  [D3]  L_reg: intensity and           M classifies rays by their error  printed, M masks skies;
+        bimodality of M, which L_rgb   at a place; early outliers are    later it would lose people
+        trains, too                    rejected; M is fixed at 60 %      that the scene memorised
   [D4]  CGNet                          a block a stage, GroupNorm, a     photos are small, eight in
                                        head at each resolution           a batch
-  [D5]  a sphere loss in a warm-up     SfM points place the sphere and   else part of the first ball
-                                       seed the octree; s and M are 0    stays before a facade
+  [D5]  a sphere loss in a warm-up     SfM points place the sphere and   else remnants of the ball
+                                       seed the octree; s and M are 0    float before facades
                                        there; lines of sight are air
   [D6]  derivatives at every sample;   at one surface point per ray, at  each is five lookups;
         no normal as an input          SfM points and in air; colours    light depends on the
@@ -493,7 +493,7 @@ class Octree(nn.Module):
         corners = pack_index(cells)[:, None] + pack_index(F.pad(octants, (1, 0)))
         key, corner, cells_around = corners.unique(return_inverse=True, return_counts=True)  # (.,)
         has_feature = cells_around == 8
-        row = (has_feature.cumsum(0) - 1).clamp_min(0)  # of a corner's feature; any, where hanging
+        row = (has_feature.cumsum(0) - 1).clamp_min(0)  # feature row of a corner; unused if hanging
         key = key[has_feature]  # (V,)
         is_old = torch.isin(key, self.corner_key)
 
@@ -621,7 +621,7 @@ def colors_of(network, geo, per_ray):
     return mixed_precision(network, inputs).sigmoid()
 
 
-# its centre and its corners, at a distance of 3^0.5
+# a tetrahedron's centre and corners; the corners are 3^0.5 away from it
 TETRAHEDRON = ((0, 0, 0), (1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1))
 
 
@@ -713,8 +713,8 @@ def neus_alpha(sdf, zeta):
 def paper_alpha(sdf, zeta):
     """Eq. 1 as printed: sigmoid(zeta s_i + beta_i) - sigmoid(zeta s_{i+1} + beta_i), here not
     negative. beta_i, half of the slope times the length of the interval, is half of the change of
-    s. Without NeuS's division the opacities of a crossing sum to about 1. Many samples then let
-    exp(-1) of the light through: 63 % are absorbed."""
+    s. Without NeuS's division the opacities of a crossing sum to about 1. With many samples the
+    product of 1 - alpha tends to exp(-1), so 37 % of the light passes."""
     beta = sdf.diff() / 2  # (R,S)
     before = torch.sigmoid(zeta * sdf[:, :-1] + beta)
     after = torch.sigmoid(zeta * sdf[:, 1:] + beta)
@@ -872,9 +872,7 @@ class Hits(NamedTuple):
     depth: Tensor  # (R,) distance to the surface; t1 if none is met
     point: Tensor  # (R,3) the surface point
     around: Tensor  # (R,3) colour of what lies before and beyond the sphere, as it is seen
-    # (R,3) where the ray ends, in contracted space: the surface point if the foreground is solid,
-    # else the mean position of the background
-    place: Tensor
+    place: Tensor  # (R,3) where the ray ends, in contracted space: point, or the background's place
 
 
 class Rendering(NamedTuple):
@@ -887,8 +885,8 @@ class Rendering(NamedTuple):
 
 # ---- 6 Photos in the wild: transient mask and geometry preservation ------------------------------
 
-# the paper's values for Eq. 4. Its Eq. 5 has a weight of the same name, here lam_curv: with a value
-# of 2, L_curv would outweigh L_rgb [D2]
+# the paper's values for Eq. 4; the lambda_curv of its Eq. 5 is cfg.lam_curv here: with a value of
+# 2, L_curv would outweigh L_rgb [D2]
 LAMBDA_GRAD, LAMBDA_CURV = 10.0, 2.0
 MIN_THRESHOLD = 0.15  # no smaller error makes a pixel transient
 PLACE_CELLS = 32  # along an axis, of the table of errors over contracted space
@@ -952,7 +950,7 @@ def reject_outliers(mask, is_outlier, done):
     bar. The bar rises from 0 to 1 over the first REJECTION of training; then nothing is rejected.
     So at first the scene learns from the rays below their thresholds alone. The thresholds grow
     where all rays err. Later the scene must learn its own details. [D3]"""
-    bar = (done / REJECTION) ** 2  # squared: low for long
+    bar = (done / REJECTION) ** 2  # squared: it rises late
     return torch.where(is_outlier & (mask > bar), 1.0, mask)
 
 
@@ -1209,7 +1207,7 @@ class GeoNVS(nn.Module):
         R = len(rays.o)
         code = self.appearance(photos).repeat_interleave(R // len(photos), 0)  # (R,A)
         hits = self.trace(rays, code, gen)
-        n = math.ceil(R / 4)
+        n = math.ceil(R / 4)  # SfM points, and points in air
         sfm = self.sfm[random_index(gen, len(self.sfm), n)]  # (n,3)
         start, end = self.air[random_index(gen, len(self.air), n)].unbind(1)  # (n,3)
         air = start.lerp(end, uniform(gen, n, 1))  # (n,3)
@@ -1264,7 +1262,7 @@ class GeoNVS(nn.Module):
         # SfM pixels count as if they had no error: they train M = 0 [D5]
         judged = error.masked_fill(rays.has_sfm, 0)
         if self.cfg.printed("reg"):
-            reg = paper_mask_loss(M * is_counted, judged)  # with the gradient that L_rgb gives M
+            reg = paper_mask_loss(M * is_counted, judged)  # it trains M in L_rgb's place
             left_out = M.detach()
         else:
             excess = judged - self.usual_errors.threshold(place)
@@ -1441,9 +1439,9 @@ def save(run, model, optimizer, gen, state, terms):
     line |= {key: value.item() for key, value in terms.items()}
     line["psnr"] = -10 * math.log10(line["mse"] + 1e-10)  # of the step's rays, people included
     log = run / "log.jsonl"
-    is_ours = "".join(state.log) == (log.read_text() if log.exists() else "")
-    check(is_ours, f"another process trains in {run}, too: stop it and go on with --resume, or "
-          "train beside it by --name NAME")
+    log_is_unchanged = "".join(state.log) == (log.read_text() if log.exists() else "")
+    check(log_is_unchanged, f"another process trains in {run}, too: stop it and go on with "
+          "--resume, or train beside it by --name NAME")
     state.log.append(json.dumps(line) + "\n")
     saved = dict(
         config=vars(model.cfg),
@@ -1694,8 +1692,8 @@ def evaluate(model, scene, lpips=None, pictures=None):
     there are none; codes (I,A) of all photos, those of test photos fitted. The dictionary
     `pictures` gets each photo with its render to the right of it, by name."""
     codes = model.codes().clone()
-    for some in scene.test.split(32):
-        codes[some] = fit_codes(model, scene, some)
+    for photos in scene.test.split(32):
+        codes[photos] = fit_codes(model, scene, photos)
     rows = []
     for photo in progress(scene.test.tolist(), "scoring held-out photos"):
         name = str(scene.raw["name"][photo])
@@ -1899,7 +1897,7 @@ def finish(model, scene, state, run, processes=ALONE):
     atomic_write(run / "metrics.json", lambda part: part.write_text(json.dumps(metrics, indent=1)))
     write_picture(run / "panel.png", lambda: draw_panel(model, scene, codes))
     for name, picture in pictures.items():
-        name = name.removesuffix(".png") + ".png"
+        name = name.removesuffix(".png") + ".png"  # a.png stays, a.jpg becomes a.jpg.png
         write_picture(run / "held_out" / name, lambda: picture)
     for key, value in metrics.items():
         if isinstance(value, float):
