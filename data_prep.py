@@ -149,14 +149,14 @@ def run_command_line(entry, go_on="start again"):
         except UserError as error:
             message = str(error)
         except OSError as error:  # a full disk, a folder without permission
-            message = f"{error}: make room, or choose another place or --name; {go_on}"
+            message = f"{error}: make room, or choose another place (in training: --name); {go_on}"
         except KeyboardInterrupt as stop:
             message = str(stop) or f"stopped; {go_on}"
         except Exception as error:
             if not is_memory_full(error):
                 raise
-            message = ("the memory is full: end other programs, or begin anew with fewer --rays or "
-                       f"a larger --downscale; {go_on}")
+            message = ("the memory is full: end other programs, or begin anew with a larger "
+                       f"--downscale (in training: or fewer --rays); {go_on}")
     with contextlib.suppress(OSError):  # the terminal may be closed
         warn(f"error: {message}")
     sys.exit(2)

@@ -834,8 +834,10 @@ class Background(nn.Module):
         before = rays.near.lerp(t0, stratified(rays, n, gen))  # (R,n)
         u = stratified(rays, self.samples - n, gen)  # (R,S-n)
         beyond = u / (1 - u).clamp_min(1e-3)  # (R,S-n) at most 1,000 radii
-        length = torch.cat([torch.cat([before, t0], 1).diff(), beyond.diff()], 1)  # (R,S-1)
-        x = contract(rays.at(torch.cat([before, t1 + beyond], 1)))  # (R,S,3)
+        length_before = torch.cat([before, t0], 1).diff()  # (R,n)
+        length = torch.cat([length_before, beyond.diff()], 1)  # (R,S-1)
+        t = torch.cat([before, t1 + beyond], 1)  # (R,S)
+        x = contract(rays.at(t))  # (R,S,3)
         inputs = torch.cat([x, self.octree(x)], 2)  # (R,S,3+LC)
         out = mixed_precision(self.density, inputs)  # (R,S,1+GEOMETRY_FEATURES)
         sigma, geo = out.split([1, GEOMETRY_FEATURES], 2)
@@ -843,10 +845,12 @@ class Background(nn.Module):
         alpha = 1 - torch.exp(-sigma[:, :-1] * length)  # (R,S-1)
         w = composite(F.pad(alpha, (0, 1), value=1.0))  # (R,S)
         colors = w[..., None] * colors_of(self.color, geo, per_ray)  # (R,S,3)
+        color_before = colors[:, :n].sum(1)  # (R,3)
+        color_beyond = colors[:, n:].sum(1)  # (R,3)
         passed = 1 - w[:, :n].sum(1, keepdim=True)  # (R,1)
         w_beyond = F.normalize(w[:, n:].detach(), p=1, dim=1)
         place = torch.einsum("rs,rsc->rc", w_beyond, x[:, n:])
-        return colors[:, :n].sum(1), passed, colors[:, n:].sum(1), place
+        return color_before, passed, color_beyond, place
 
 
 def surface_depth(t, sdf, w):
@@ -1181,9 +1185,9 @@ class GeoNVS(nn.Module):
         # the sample at either end [D1]
         w = F.avg_pool1d(interval_w, 2, stride=1, padding=1)  # (R,S+1)
 
+        before = 0  # nothing stands there
         beyond = self.bg_color  # (3,)
         bg_place = 2 * rays.d  # (R,3) infinity
-        before = 0
         if self.background:
             per_ray = torch.cat([rays.d, code], 1)  # (R,3+A)
             before, passed, beyond, bg_place = self.background(rays, t0, t1, per_ray, gen)
@@ -1488,7 +1492,7 @@ def restore(saved, model, gen=None):
     with as_user_error("checkpoint.pt does not fit settings or kind of device",
                       "use those it was made with"):
         changed = changes(saved["scene"], fingerprint(model.scene))
-        check(not changed, "checkpoint.pt was trained with other photos, splits, sizes or cameras: "
+        check(not changed, "checkpoint.pt was trained with other photos, cameras, masks or points: "
               f"{len(changed)} differ, first {changed[:1]}: use its data, or another --name")
         for octree, keys in zip(model.octrees, saved["octrees"], strict=True):
             octree.corner_key = octree.corner_key[:0]  # no corner is carried over
