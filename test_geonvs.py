@@ -977,6 +977,7 @@ def touch_all(model):
     notes=(new("place/notes.txt"), False),
     table_without_split=(new("place/notes.csv"), False),
     photo_without_pose=(new(IMAGES / "without_pose.png"), False),
+    unused_masks=(new("place/unmasked_old/toy_000.png"), False),
     sources_gone=(move(Path("place")), False),
     other_size=(lambda model: data_prep.open_scene("place", 4), True),
     other_photo=(append(PHOTO), True),
@@ -2410,6 +2411,7 @@ def test_a_step_asks_its_device_for_nothing(scene, monkeypatch, parts):
     model = make_model(scene, appearance=parts, background=parts, mask=parts)
     train_on_meta(model, monkeypatch)
     assert model.deviation.grad.is_meta
+    assert (model.mask is not None) == (parts == "on")
 
 
 @cases(
