@@ -104,11 +104,14 @@ def warn(message):
     print(message, file=sys.stderr)
 
 
-def allow_any_character():
-    """From now on a character that the terminal lacks is printed as its code."""
-    for stream in (sys.stdout, sys.stderr):
-        if hasattr(stream, "reconfigure"):  # a notebook's streams print any character
-            stream.reconfigure(errors="backslashreplace")
+@contextlib.contextmanager
+def as_user_error(errors, what, advice):
+    """An error of these types becomes one sentence: what went wrong, its reason, and what to do."""
+    try:
+        yield
+    except errors as e:
+        reason = " ".join(str(getattr(e, "strerror", None) or e).split())
+        raise UserError(f"{what} ({reason}): {advice}") from e
 
 
 @contextlib.contextmanager
@@ -141,7 +144,9 @@ def is_memory_full(error):
 def run_command_line(entry, go_on="start again"):
     """Exit code 0, or 2 with one sentence on stderr; a bug keeps its traceback. go_on: what to do
     after a stop."""
-    allow_any_character()
+    for stream in (sys.stdout, sys.stderr):
+        if hasattr(stream, "reconfigure"):  # a notebook's streams print any character
+            stream.reconfigure(errors="backslashreplace")  # a terminal's lack some
     with on_signals(signal.default_int_handler):
         try:
             entry()
@@ -182,15 +187,13 @@ def atomic_write(path, write):
     """write(temporary path), then rename: `path` is the whole old file or the new one."""
     # Without the stem: a name may have 255 bytes already.
     temporary = path.with_name(f".{os.getpid()}.{time.time_ns()}{path.suffix}")
-    try:
+    with as_user_error(OSError, f"cannot write {path}", "free or choose a place"):
         path.parent.mkdir(parents=True, exist_ok=True)
-        write(temporary)
-        temporary.replace(path)
-    except OSError as e:
-        message = f"cannot write {path} ({e.strerror or e}): free or choose a place"
-        raise UserError(message) from e
-    finally:
-        temporary.unlink(missing_ok=True)
+        try:
+            write(temporary)
+            temporary.replace(path)
+        finally:
+            temporary.unlink(missing_ok=True)
 
 
 def write_scene(path, scene):
@@ -207,12 +210,8 @@ def write_png(path, picture):
 def write_ply(path, vertices, faces, colors):
     """A binary PLY file of vertices (P,3), faces (N,3) and the vertices' colours (P,3) in bytes.
     Coordinates are doubles, as floats would round those of a map."""
-    vertex = np.empty(len(vertices), [("xyz", "<f8", 3), ("rgb", "u1", 3)])
-    vertex["xyz"] = vertices
-    vertex["rgb"] = colors
-    face = np.empty(len(faces), [("count", "u1"), ("corner", "<i4", 3)])
-    face["count"] = 3
-    face["corner"] = faces
+    vertex = np.rec.fromarrays([vertices, colors], formats="(3,)<f8, (3,)u1")
+    face = np.rec.fromarrays([np.full(len(faces), 3), faces], formats="u1, (3,)<i4")
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}"]
     header += [f"property double {axis}" for axis in "xyz"]
     header += [f"property uchar {channel}" for channel in ("red", "green", "blue")]
@@ -230,38 +229,37 @@ def refuse_bomb(path):
 
 
 def check_scene(scene):
-    """UserError with the name of the first bad array; read_scene turns it into a sentence."""
+    """UserError with what is wrong, unless the arrays fit FORMAT and each other."""
     sizes = {2: 2, 3: 3, 4: 4}  # by name, of the first array that has it
     optional = {key: OPTIONAL[key] for key in OPTIONAL.keys() & scene}
     for key, (dtype, shape) in (FORMAT | optional).items():
         value = scene[key]
-        has_dtype = str(value.dtype).startswith(dtype)  # "<U" fits a text of any length
-        check(has_dtype and value.ndim == len(shape), key)
+        is_fit = str(value.dtype).startswith(dtype)  # "<U" fits a text of any length
+        check(is_fit and value.ndim == len(shape), f"{key} is no {dtype} with axes {shape}")
         for name, size in zip(shape, value.shape):
-            check(sizes.setdefault(name, size) == size, key)
+            check(sizes.setdefault(name, size) == size, f"{key} has {size} {name}")
         if dtype.startswith("float") and key not in ("bg_color", "depth"):
-            check(np.isfinite(value).all(), key)
+            check(np.isfinite(value).all(), f"{key} is not finite")
     for key, count in [("track_photo", sizes["photos"]), ("track_point", sizes["points"])]:
-        check((scene[key] >= 0).all() and (scene[key] < count).all(), key)
+        check(((scene[key] >= 0) & (scene[key] < count)).all(), f"{key} is not in 0..{count - 1}")
+    for key in ("wh", "footprint", "scale"):
+        check((scene[key] > 0).all(), f"{key} is not positive")
     start = np.cumsum([0, *scene["wh"].prod(1)])
-    check(scene["wh"].min() > 0 and np.array_equal(scene["start"], start), "start")
-    check(start[-1] == sizes["pixels"], "rgb")
-    check(scene["footprint"] > 0 and scene["scale"] > 0, "scale")
-    check(not scene["is_test"].all(), "is_test")
+    check(np.array_equal(scene["start"], start) and start[-1] == sizes["pixels"], "start is wrong")
+    check(not scene["is_test"].all(), "no photo is for training")
     info = json.loads(str(scene["info"]))
-    check({"kind", "scene", "downscale", "folder", "split"} <= set(info), "info")
+    check({"kind", "scene", "downscale", "folder", "split"} <= set(info), "info lacks a key")
 
 
 def read_scene(path):
     """The dictionary of a scene file; UserError unless it is whole and fits FORMAT."""
-    try:
+    what = f"{path} is no whole scene, or too large"
+    # A damaged file can fail in any layer: zip, header, dtype, text.
+    with as_user_error(Exception, what, "delete it, it is remade"):
         refuse_bomb(path)
         with np.load(path, allow_pickle=False) as file:
             scene = dict(file)
         check_scene(scene)
-    except Exception as e:  # a damaged file can fail in any layer: zip, header, dtype, text
-        message = f"{path} is no whole scene, or too large: delete it, it is remade"
-        raise UserError(message) from e
     return scene
 
 
@@ -288,11 +286,6 @@ def project(K, c2w, x):
     return np.where(z > 0, uv, -MAX_NUMBER), lengths(p)
 
 
-def is_in_photo(uv, wh):
-    """Which pixels uv (P,2) lie in a photo of width and height wh. -> (P,)"""
-    return ((uv >= 0) & (uv < wh)).all(1)
-
-
 def pixel_index(uv, wh):
     """Row-by-row indices of pixels uv (P,2), moved inside a photo of size wh. -> (P,)"""
     return np.clip(uv, 0, np.subtract(wh, 1)).astype(int) @ (1, wh[0])
@@ -311,12 +304,11 @@ class Photo:
 
 
 def find_sphere(x, weight, photos, contain):
-    """Centre (3,) and radius of the scene sphere, which becomes the unit sphere [D5].
-
-    Centre: geometric median of points x (P,3) by weight. Radius: 1.1 x the distance of
-    95 %; if that is a skyline, more than four times the median distance away, only
-    nearer points are counted. At least half of the training photos have 30 % of their
-    points inside. All points contain (...,3) are inside."""
+    """Centre (3,) and radius of the scene sphere, which becomes the unit sphere [D5]. Centre:
+    geometric median of points x (P,3) by weight. Radius: 1.1 x the distance of 95 %; if that is a
+    skyline, more than four times the median distance away, only nearer points are counted. At
+    least half of the training photos have 30 % of their points inside. All points contain (...,3)
+    are inside."""
     center = np.median(x, axis=0)
     for _ in range(20):  # Weiszfeld
         w = weight / np.maximum(lengths(x - center), EPSILON)
@@ -394,8 +386,8 @@ def build_scene(photos, points, info, contain=()):
 
 
 def brightness_spread(points, brightness):
-    """How much brightness differs between photos: the standard deviation of each photo's
-    median offset from its points' mean brightness. points, brightness: a (M,) per photo."""
+    """How much brightness differs between photos: the standard deviation of each photo's median
+    offset from its points' mean brightness. points, brightness: a (M,) per photo."""
     all_points = np.concatenate(points)
     mean = np.bincount(all_points, np.concatenate(brightness))
     mean /= np.maximum(np.bincount(all_points), 1)  # (P,)
@@ -415,7 +407,6 @@ def common_color(colors):
 
 def add_statistics(scene):
     """Adds the arrays that follow from the others.
-
     near: 0.8 x the 2 % quantile of the distances of a photo's points, >= 0.02;
     0.05 without points. The others are about pixels of training photos without a mask.
     footprint: lower quartile of a pixel's size at points in the sphere.
@@ -445,8 +436,7 @@ def add_statistics(scene):
         is_background = (lengths(closest) > 1) & ~masked[pixel]
         background.append(rgb[pixel[is_background][::step]])
     return scene | dict(
-        near=np.float32(near),
-        track_uv=np.concatenate(track_uv, dtype=np.float32),
+        near=np.float32(near), track_uv=np.concatenate(track_uv, dtype=np.float32),
         footprint=np.quantile(np.concatenate(sizes), 0.25),
         exposure_spread=brightness_spread(observed, brightness),
         bg_color=common_color(np.concatenate(background)))
@@ -471,12 +461,10 @@ def records(path):
     file = io.BytesIO(path.read_bytes())
 
     def read(layout):
-        try:
+        # An error says that too few bytes are left, or that the count is absurd.
+        with as_user_error(struct.error, f"{path} is cut off", "copy it, or delete its folder"):
             record = struct.Struct("<" + layout)  # little-endian, without gaps
             return record.unpack(file.read(record.size))
-        except struct.error as e:  # too few bytes are left, or the count is absurd
-            message = f"{path} ends too early: copy it again, or delete its folder"
-            raise UserError(message) from e
     (count,) = read("Q")
     for _ in range(count):
         yield read
@@ -509,8 +497,7 @@ def read_photos(sparse):
         name = b"".join(letters).decode(errors="surrogateescape")
         name = name.replace("\\", "/")  # of Windows
         (observations,) = read("Q")
-        # Records (u, v, point id), 8 bytes each; u and v are doubles and are skipped.
-        ids = read(f"{3 * observations}Q")[2::3]
+        ids = read(f"{3 * observations}Q")[2::3]  # of (u, v, point id), 8 bytes each
         is_outside = any(step in ("", "..") for step in name.split("/"))
         check(name not in photos and not is_outside,
               f"{sparse}: rename photo {name!r}, which occurs twice or is outside the folder")
@@ -567,10 +554,9 @@ COPY_ENDINGS = ("~", "_original", ".bak", ".thm")
 
 
 def files_below(folder, levels=7):
-    """Files at most so many levels down, without hidden folders and thumbnails.
-
-    Links are followed, unlike by rglob. A broken link counts as a file, and so does a
-    folder that may not be read."""
+    """Files at most so many levels down, without hidden folders and thumbnails. Links are
+    followed, unlike by rglob. A broken link counts as a file, and so does a folder that may not be
+    read."""
     try:
         paths = sorted(folder.iterdir()) if levels and folder.is_dir() else []
     except PermissionError:
@@ -592,9 +578,8 @@ def starts_with(path, pattern):
 
 
 def photo_files(folder, posed=()):
-    """{name: path} of the photos below a folder, without masks/ and copies in dense/.
-
-    A file that the model names is one of them, whatever its type."""
+    """{name: path} of the photos below a folder, without masks/ and copies in dense/. A file that
+    the model names is one of them, whatever its type."""
     files = {}
     for path in files_below(folder):
         name = path.relative_to(folder).as_posix()
@@ -607,9 +592,8 @@ def photo_files(folder, posed=()):
 
 
 def match_names(wanted, there):
-    """{wanted name: its name there}: equal, or alike if only one has it on each side.
-
-    Names that differ in case or Unicode form only are alike."""
+    """{wanted name: its name there}: equal, or alike if only one has it on each side. Names that
+    differ in case or Unicode form only are alike."""
     forms = []
     for names in (wanted, there):
         alike = defaultdict(set)
@@ -630,13 +614,11 @@ def name_hint(name, names):
 
 def mask_folders(images):
     """Folders with "mask" in their name, in the folder of photos and beside it; masks/ first."""
-    folders = []
     places = [images, images.parent]
     if images.parent.name == "dense":
         places.append(images.parent.parent)
-    for place in places:
-        folders += [path for path in place.glob("*[mM][aA][sS][kK]*") if path.is_dir()]
-    return sorted(folders, key=lambda path: path.name.lower() != "masks")
+    paths = [path for place in places for path in place.glob("*[mM][aA][sS][kK]*")]
+    return sorted(filter(Path.is_dir, paths), key=lambda path: path.name.lower() != "masks")
 
 
 def mask_files(images, names):
@@ -667,14 +649,11 @@ def open_model(folder, sparse):
     models = []
     for images in [place / name for place in around for name in ("images", "input", "")]:
         on_disk = photo_files(images, photos)
-        matches = match_names(photos, on_disk)
+        files = {name: on_disk[other] for name, other in match_names(photos, on_disk).items()}
+        count = sum(photos[name][0] is not None for name in files)  # those with a camera
         models.append(SimpleNamespace(
-            sparse=sparse,
-            photos=photos,
-            images=images,
-            on_disk=list(on_disk),
-            files={name: on_disk[other] for name, other in matches.items()},  # of posed photos
-            count=sum(photos[name][0] is not None for name in matches)))  # those with a camera
+            sparse=sparse, photos=photos, images=images, on_disk=list(on_disk), files=files,
+            count=count))
     return max(models, key=lambda model: len(model.files))
 
 
@@ -692,8 +671,7 @@ def find_model(folder):
         around = [path.name for path in files_below(parent)]
         check("images.bin" not in around,
               f"{folder} has no COLMAP model, the folder around it has: give {parent}")
-    check(models,
-          f"{folder} has no binary COLMAP model: run {sfm}, or for a text model "
+    check(models, f"{folder} has no binary COLMAP model: run {sfm}, or for a text model "
           "colmap model_converter --output_type BIN")
     best = max(models, key=lambda model: model.count)
     check(best.photos, f"{best.sparse} is an empty model: delete it and run {sfm}")
@@ -738,9 +716,8 @@ def split_files(folder, split):
 
 
 def read_split(paths, names):
-    """{name: whether it is held out} of what split_files finds, with names as they are here.
-
-    A table has NeRF-W's columns; rows with an empty id do not count."""
+    """{name: whether it is held out} of what split_files finds, with names as they are here. A
+    table has NeRF-W's columns; rows with an empty id do not count."""
     print(f"split by {paths[0]}")
     subsets = {}
     for row in itertools.chain(*map(read_table, paths)):
@@ -787,10 +764,9 @@ GREY_WITH_ALPHA = re.compile(rb"\x15\x01\x03\0\x01\0\0\0\x02\0|\x01\x15\0\x03\0\
 
 
 def is_cut_off(data):
-    """Whether a JPEG or PNG file lacks its end, which OpenCV does not report.
-
-    A JPEG ends with its first end mark. A video or raw data may follow, and a segment
-    before it may hold a thumbnail with an end of its own."""
+    """Whether a JPEG or PNG file lacks its end, which OpenCV does not report. A JPEG ends with its
+    first end mark. A video or raw data may follow, and a segment before it may hold a thumbnail
+    with an end of its own."""
     if data[:2] != b"\xff\xd8":
         return data[1:4] == b"PNG" and b"IEND" not in data
     at = 2
@@ -812,7 +788,7 @@ def read_image(path, flags):
         raise UserError(f"cannot be read: {e.strerror}") from e
     except cv2.error as e:  # empty, or more than a gigapixel
         if is_memory_full(e):
-            raise MemoryError("the memory is full: use smaller photos") from e
+            raise
         image = None
     check(image is not None, "is empty, damaged, too large or of an unknown type: replace it")
     return image
@@ -862,9 +838,8 @@ def read_opaque(path, is_mask):
 
 
 def read_mask(photo, path, size):
-    """The mask of a photo by its alpha channel and its mask file, if any, in size (w, h).
-
-    -> uint8 (h,w): 0 is left out, 255 is not. A bad mask is told."""
+    """The mask of a photo by its alpha channel and its mask file, if any, in size (w, h): uint8
+    (h,w), where 0 is left out and 255 is not. A bad mask is told."""
     w, h = size
     mask = np.full((h, w), 255, np.uint8)
     for file in [photo, path] if path else [photo]:
@@ -884,9 +859,8 @@ def read_mask(photo, path, size):
 
 # ---- prepare ---------------------------------------------------------------------------
 def read_usable(model, points, rows, is_held_out, downscale):
-    """The photos that can be used, sorted by name. Prints which cannot, and why.
-
-    Of photos with the same pixels one is used for training, or none if one is held out."""
+    """The photos that can be used, sorted by name. Prints which cannot, and why. Of photos with
+    the same pixels one is used for training, or none if one is held out."""
     masks = mask_files(model.images, model.files)
     photos = []
     first = {}  # by hash of pixels: name of the first photo that has them
@@ -908,7 +882,7 @@ def read_usable(model, points, rows, is_held_out, downscale):
             c2w = camera_to_world(pose)
             track = np.array([rows[key] for key in ids if key in rows], int)
             uv, _ = project(K, c2w, points[track, :3])
-            is_inside = is_in_photo(uv, image.shape[1::-1])
+            is_inside = ((uv >= 0) & (uv < image.shape[1::-1])).all(1)
             share = is_inside.mean() if len(track) else 1
             misfits += share < 0.5
             check(share >= 0.5, f"shows {share:.0%} of its points: wrong pose or distortion")
@@ -932,11 +906,8 @@ def read_usable(model, points, rows, is_held_out, downscale):
 
 def check_sphere(scene):
     """Prints size and content of the sphere; UserError if points and poses disagree."""
-    spread = [
-        np.std(scene["track_uv"][scene["track_photo"] == i], axis=0).max()
-        for i in np.unique(scene["track_photo"])
-    ]
-    check(np.median(spread) > 0.02,
+    seen = [scene["track_uv"][scene["track_photo"] == i] for i in np.unique(scene["track_photo"])]
+    check(np.median([np.std(uv, axis=0).max() for uv in seen]) > 0.02,
           "the points of a photo lie on one spot of it: give poses in the units of the points")
     inside = (lengths(scene["points"]) < 1).mean()
     print(f"the sphere has a radius of {scene['scale']:.3g} units of the reconstruction; "
@@ -948,16 +919,18 @@ def check_sphere(scene):
              "in a room: expect poor geometry; this method is for a landmark seen from outside")
 
 
-def read_folder(folder, downscale, split):
+def prepare(name, downscale=2, split=None):
+    """Scene of one of SCENES, or of a folder with photos and a COLMAP model; see FORMAT."""
+    folder = Path(name)
+    if name in SCENES:
+        homes = [DATA / name, DATA / SCENES[name][0]]
+        folder = next(filter(Path.is_dir, homes), None)
+        check(folder, f"{homes[0]} is missing: run python data_prep.py {name} --download")
+    split = split and os.path.abspath(split)
     model = find_model(folder)
     info = dict(
-        scene=folder.resolve().name,
-        kind="colmap",
-        downscale=downscale,
-        folder=str(folder),
-        images=str(model.images),
-        posed=sorted(model.photos),
-        split=split)
+        scene=folder.resolve().name, kind="colmap", downscale=downscale, folder=str(folder),
+        images=str(model.images), posed=sorted(model.photos), split=split)
     info["files"] = fingerprint(info)
     tables = split_files(folder, split)
     is_held_out = dict.fromkeys(model.files, False)
@@ -978,23 +951,6 @@ def read_folder(folder, downscale, split):
     return scene
 
 
-def prepare(name, downscale=2, split=None):
-    """Scene of one of SCENES, or of a folder with photos and a COLMAP model; see FORMAT."""
-    folder = Path(name)
-    if name in SCENES:
-        folder = DATA / name
-        if not folder.is_dir():
-            folder = DATA / SCENES[name][0]
-        check(folder.is_dir(), f"{folder} is missing: run python data_prep.py {name} --download")
-    try:
-        return read_folder(folder, downscale, split and os.path.abspath(split))
-    except (MemoryError, cv2.error) as e:
-        if not is_memory_full(e):
-            raise
-        message = f"the memory is full: use a larger --downscale than {downscale}"
-        raise UserError(message) from e
-
-
 def scene_path(name_or_folder):
     """data/<scene>.npz; folders get a suffix, so that two of one name do not share a file."""
     folder = Path(name_or_folder).resolve()
@@ -1004,9 +960,8 @@ def scene_path(name_or_folder):
 
 
 def open_scene(name_or_folder, downscale=2):
-    """Scene from its file: made on first use, and anew if the content of a source differs.
-
-    Where the sources are gone the file is all that is needed."""
+    """Scene from its file: made on first use, and anew if the content of a source differs. Where
+    the sources are gone the file is all that is needed."""
     path = scene_path(name_or_folder)
     split = None
     if path.exists():
@@ -1019,8 +974,7 @@ def open_scene(name_or_folder, downscale=2):
         if info["downscale"] == downscale and (is_gone or info["files"] == fingerprint(info)):
             return scene
     print(f"making {path}")
-    is_toy = name_or_folder == "toy"
-    scene = make_toy() if is_toy else prepare(name_or_folder, downscale, split)
+    scene = make_toy() if name_or_folder == "toy" else prepare(name_or_folder, downscale, split)
     write_scene(path, scene)
     return scene
 
@@ -1112,10 +1066,8 @@ for x, y, wide, tall in [  # a house: half width, half height; a tree stands bef
 def toy_parts(landmark, background=True):
     """The parts of a landmark, every number another building, and of the town around."""
     town = TOWN if background else []
-    if landmark == FACADE:
-        return PALACE + town
-    if landmark == 0:
-        return LANDMARK + town
+    if landmark in (0, FACADE):
+        return {0: LANDMARK, FACADE: PALACE}[landmark] + town
     rng = np.random.default_rng([landmark, 1])
     parts = list(LANDMARK)
     # Random proportions, moved a little; the dome also with the hall.
@@ -1129,19 +1081,14 @@ def toy_parts(landmark, background=True):
         for i in chosen:
             part = parts[i]
             grow = size if part.shape == "box" else size[[2, 2, 2]]  # others stay round
-            parts[i] = part._replace(
-                center=foot + (part.center - foot) * size + shift,
-                half=part.half * grow,
-                top=part.top * grow[0])
+            center = foot + (part.center - foot) * size + shift
+            parts[i] = part._replace(center=center, half=part.half * grow, top=part.top * grow[0])
     mirror = np.array([rng.choice((-1, 1)), 1, 1])
     material = {"gold": "gold"}
     for names in INTERCHANGEABLE:
         material |= dict(zip(names, rng.permutation(names)))
-    parts = [
-        part._replace(center=part.center * mirror, material=material[part.material])
-        for part in parts
-    ]
-    return parts + town
+    return [part._replace(center=part.center * mirror, material=material[part.material])
+            for part in parts] + town
 
 
 def part_sdf(part, x):
@@ -1186,10 +1133,9 @@ def gradient(sdf, x, step):
 
 @np.errstate(divide="ignore", invalid="ignore")  # rays that miss, or are parallel
 def intersect_part(part, o, d):
-    """Distances at which rays o, d (R,3) enter a part; inf for a miss. -> (R,)
-
-    A part is a quadric, round in the first n coordinates, with a radius linear in z; a
-    slab cuts it in each other coordinate. A roof has n = 1, a cone n = 2, a ball n = 3."""
+    """Distances (R,) at which rays o, d (R,3) enter a part; inf for a miss. A part is a quadric,
+    round in the first n coordinates, with a radius linear in z; a slab cuts it in each other
+    coordinate. A roof has n = 1, a cone n = 2, a ball n = 3."""
     o = o - part.center
     if part.shape == "ground":
         t = -o[:, 2] / d[:, 2]
@@ -1228,10 +1174,8 @@ def sky_color(d, weather):
     cloud = np.sin(5 * azimuth + 9 * phase) * np.sin(12 * up + 7 * phase)
     color = (0.58, 0.68, 0.78) - np.clip(up * 1.5, 0, 1) * (0.52, 0.46, 0.26)
     color += 0.4 * np.array(tint) + 0.5 * abs(phase) * np.maximum(cloud, 0)
-    for height, amplitude, waves, hill in [
-        (0.11, 0.045, 5, (0.25, 0.33, 0.45)),
-        (0.06, 0.03, 9, (0.11, 0.18, 0.16)),
-    ]:
+    for height, amplitude, waves, hill in [(0.11, 0.045, 5, (0.25, 0.33, 0.45)),
+                                           (0.06, 0.03, 9, (0.11, 0.18, 0.16))]:
         ridge = np.sin(waves * azimuth + height * 40) + 0.6 * np.sin(2.3 * waves * azimuth)
         color = np.where(up < height + amplitude * ridge, hill, color)
     return color
@@ -1262,7 +1206,6 @@ def surface_color(part, x):
 
 def shade(o, d, parts, background, sun, weather):
     """Linear colours along rays, in 0..1: sun, shadow, light of the sky, haze.
-
     o (1,3), d (R,3), sun (3,) -> (R,3)
     weather (4,): RGB tint of the sky and cloud phase, each in -sky..sky of make_toy."""
     color = sky_color(d, weather) * background
@@ -1286,9 +1229,8 @@ def shade(o, d, parts, background, sun, weather):
 
 
 def toy_camera(rng, azimuth, size):
-    """A tourist's camera at `azimuth` [rad] from the front, in the toy's units.
-
-    -> K (4,), c2w (3,4), width, height"""
+    """K (4,), c2w (3,4), width and height of a tourist's camera, in the toy's units. azimuth is
+    its angle [rad] from the front."""
     aspect = rng.choice([4 / 3, 3 / 2, 1.1, 3 / 4, 2 / 3])
     w = round(size * min(1, aspect))
     h = round(size * min(1, 1 / aspect))
@@ -1338,10 +1280,9 @@ def draw_people(rng, w, h, share):
 
 
 def toy_points(rng, photos, surface, seen):
-    """Points (P,5) as by SfM, noisy and 1.5 % of them wrong, as in build_scene; sets tracks.
-
-    For each photo, surface: points (h*w,3) that the pixels see; seen: their distances
-    (h*w,), inf where a person is in front"""
+    """Points (P,5) as by SfM, noisy and 1.5 % of them wrong, as in build_scene; sets tracks. For
+    each photo, surface: points (h*w,3) that the pixels see; seen: their distances (h*w,), inf
+    where a person is in front"""
     samples = []
     count = 3000 // len(photos)
     for x, t in zip(surface, seen):
@@ -1356,7 +1297,8 @@ def toy_points(rng, photos, surface, seen):
         uv, distance = project(photo.K, photo.c2w, x)
         is_visible = abs(t[pixel_index(uv, wh)] / distance - 1) < 0.02
         is_found = rng.random(len(x)) < 0.6
-        photo.track = np.flatnonzero(is_in_photo(uv, wh) & is_visible & is_found)
+        is_inside = ((uv >= 0) & (uv < wh)).all(1)
+        photo.track = np.flatnonzero(is_inside & is_visible & is_found)
     is_wrong = rng.random((len(x), 1)) < 0.015
     x += is_wrong * rng.uniform(-1, 1, x.shape)
     x += rng.normal(0, 0.005, x.shape)
@@ -1374,10 +1316,7 @@ def add_pose_noise(rng, K, c2w, pixels):
 
 def make_toy(seed=0, size=96, photos=48, test=8, occluders=0.05, exposure=1.0,
              pose_noise=0.0, background=True, landmark=0, sun=0.0, sky=0.0):
-    """A synthetic scene.
-
-    `seed` changes cameras, people and noise; only `landmark` changes the building.
-
+    """A synthetic scene. seed changes cameras, people and noise; only landmark the building.
     photos, test: number of training photos and of held-out photos
     size: long side of a photo [px]
     occluders: mean share of a training photo that people cover, 0 to 0.6
@@ -1459,11 +1398,8 @@ def surface_truth(scene, surface, background, landmark):
     near = wall + np.random.default_rng(0).normal(0, 0.02, wall.shape)
     distance = sdf(near)
     is_near = abs(distance) < 0.05
-    return dict(
-        wall=wall[is_smooth],
-        wall_normal=normal[is_smooth],
-        near_wall=near[is_near],
-        near_wall_sdf=distance[is_near])
+    return dict(wall=wall[is_smooth], wall_normal=normal[is_smooth],
+                near_wall=near[is_near], near_wall_sdf=distance[is_near])
 
 
 def depth_edges(depth):
@@ -1481,7 +1417,6 @@ def depth_edges(depth):
 def toy_truth(scene, sdf, gradient, mask=None):
     """What only a toy can tell of a trained model. sdf (.,): its signed distance at near_wall;
     gradient (.,3): the slope of that at wall; mask (P,): its M at all pixels of training photos.
-
     sdf_error is the mean |s - s_true| near visible walls in scene units, normal_error the median
     angle at walls in degrees. mask_iou compares M > 0.5 with the true people. False positives are
     the mean M on static pixels: mask_static on all, mask_edges on those beside a jump of depth,
@@ -1512,9 +1447,8 @@ def toy_truth(scene, sdf, gradient, mask=None):
 
 # ---- download, SfM, command line -------------------------------------------------------
 def fetch(folder_url, path):
-    """Streams the file of path's name into path, unless that exists.
-
-    The part that came of a broken transfer waits in path.part to be continued."""
+    """Streams the file of path's name into path, unless that exists. The part that came of a
+    broken transfer waits in path.part to be continued."""
     if path.exists():
         return
     url = folder_url + path.name
@@ -1551,19 +1485,18 @@ def download(name):
     fetch(SPLIT_URL, DATA / split)
     fetch(ARCHIVE_URL, archive)
     wanted = (f"{inner}/dense/images/", f"{inner}/dense/sparse/")
-    try:
-        with tempfile.TemporaryDirectory(dir=DATA) as temporary:
-            with gzip.open(archive) as raw, tarfile.open(fileobj=raw, mode="r|") as tar:
-                for member in tar:  # files only: a link could lead outside
-                    if member.isfile() and member.name.startswith(wanted):
-                        tar.extract(member, temporary, filter="data")
-                while raw.read(1 << 20):  # to the checksum at the very end
-                    pass
-            shutil.copy(DATA / split, Path(temporary, inner, split))
-            Path(temporary, inner).replace(folder)
-    except Exception as e:  # a damaged archive can fail in any layer
-        message = f"cannot unpack {archive} ({e}): free space, or delete it and retry"
-        raise UserError(message) from e
+    # A damaged archive can fail in any layer.
+    advice = "free space, or delete it and retry"
+    with (as_user_error(Exception, f"cannot unpack {archive}", advice),
+          tempfile.TemporaryDirectory(dir=DATA) as temporary):
+        with gzip.open(archive) as raw, tarfile.open(fileobj=raw, mode="r|") as tar:
+            for member in tar:  # files only: a link could lead outside
+                if member.isfile() and member.name.startswith(wanted):
+                    tar.extract(member, temporary, filter="data")
+            while raw.read(1 << 20):  # to the checksum at the very end
+                pass
+        shutil.copy(DATA / split, Path(temporary, inner, split))
+        Path(temporary, inner).replace(folder)
 
 
 def sfm_photos(images):
@@ -1597,8 +1530,7 @@ def write_sfm_masks(files, masks, folder):
 
 
 def run_sfm(folder):
-    """Finds the poses of the raw photos in `folder` by pycolmap -> folder/sparse/{0,1,...}
-
+    """Finds the poses of the raw photos in a folder by pycolmap and writes folder/sparse/{0,1,...}.
     The database waits in data/ for a second try and goes after a success."""
     images = folder / "images"
     if not images.is_dir():
@@ -1608,13 +1540,12 @@ def run_sfm(folder):
           f"{folder} has sparse/ or dense/, a model: leave --sfm out, or delete that")
     files = sfm_photos(images)
     masks = mask_files(images, files)
-    try:
+    missing_or_old = (ImportError, AttributeError)
+    with as_user_error(missing_or_old, "--sfm needs pycolmap", 'run pip install "pycolmap>=3.13"'):
         import pycolmap  # an extra
         reader = pycolmap.ImageReaderOptions()
         features = pycolmap.FeatureExtractionOptions()
         matching = pycolmap.FeatureMatchingOptions()
-    except (ImportError, AttributeError) as e:  # missing, or too old
-        raise UserError(f'--sfm needs pycolmap ({e}): run pip install "pycolmap>=3.13"') from e
     work = DATA / f"sfm-{checksum([*files.values(), *masks.values()]):08x}"
     database = work / "database.db"
     (work / "masks").mkdir(parents=True, exist_ok=True)
@@ -1627,15 +1558,12 @@ def run_sfm(folder):
     with tempfile.TemporaryDirectory(prefix=".sparse", dir=folder) as temporary:
         models = Path(temporary, "models")
         models.mkdir()
-        try:
-            pycolmap.extract_features(
-                database, images, sorted(files), reader_options=reader,
-                extraction_options=features)
+        advice = f"delete {work}, which may be damaged, and retry"
+        with as_user_error((RuntimeError, ValueError), "pycolmap failed", advice):
+            pycolmap.extract_features(database, images, sorted(files), reader_options=reader,
+                                      extraction_options=features)
             pycolmap.match_exhaustive(database, matching_options=matching)
             found = pycolmap.incremental_mapping(database, images, models)
-        except (RuntimeError, ValueError) as e:
-            message = f"pycolmap failed ({e}): delete {work}, which may be damaged, and retry"
-            raise UserError(message) from e
         check(found, f"the photos in {folder} do not match: take more, with more overlap")
         models.rename(sparse)
     shutil.rmtree(work)
