@@ -594,14 +594,11 @@ def photo_files(folder, posed=()):
 def match_names(wanted, there):
     """{wanted name: its name there}: equal, or alike if only one has it on each side. Names that
     differ in case or Unicode form only are alike."""
-    forms = []
-    for names in (wanted, there):
-        alike = defaultdict(set)
-        for name in names:
-            alike[unicodedata.normalize("NFC", name).casefold()].add(name)
-        forms.append({form: min(same) for form, same in alike.items() if len(same) == 1})
-    ours, theirs = forms
-    found = {ours[form]: theirs[form] for form in ours.keys() & theirs}
+    alike = defaultdict(lambda: ([], []))  # by form: names that are wanted, names that are there
+    for side, names in enumerate((wanted, there)):
+        for name in set(names):
+            alike[unicodedata.normalize("NFC", name).casefold()][side].append(name)
+    found = {ours[0]: theirs[0] for ours, theirs in alike.values() if len(ours) == len(theirs) == 1}
     return found | {name: name for name in wanted if name in there}
 
 
@@ -1000,9 +997,6 @@ MATERIALS = dict(
     leaf=((0.1, 0.22, 0.05), (0.2, 0.2), 0.45),
     paving=((0.48, 0.42, 0.34), (0.42, 0.42), 0.2),
     meadow=((0.17, 0.22, 0.08), (0.6, 0.6), 0.1))
-WITH_WINDOWS = ("sand", "brick", "plaster")
-# Other landmarks may swap the materials of a tuple.
-INTERCHANGEABLE = [("stone", "pale"), ("sand", "brick"), ("tiles", "slate", "copper")]
 
 
 class Part(NamedTuple):
@@ -1085,7 +1079,7 @@ def toy_parts(landmark, background=True):
             parts[i] = part._replace(center=center, half=part.half * grow, top=part.top * grow[0])
     mirror = np.array([rng.choice((-1, 1)), 1, 1])
     material = {"gold": "gold"}
-    for names in INTERCHANGEABLE:
+    for names in [("stone", "pale"), ("sand", "brick"), ("tiles", "slate", "copper")]:
         material |= dict(zip(names, rng.permutation(names)))
     return [part._replace(center=part.center * mirror, material=material[part.material])
             for part in parts] + town
@@ -1192,7 +1186,7 @@ def surface_color(part, x):
     color, (width, height), contrast = MATERIALS[part.material]
     row = up / height
     column = across / width
-    if part.material in WITH_WINDOWS:
+    if part.material in ("sand", "brick", "plaster"):
         is_window = (abs(column % 1 - 0.5) < 0.2) & (abs(row % 1 - 0.45) < 0.28)
     else:
         is_window = False

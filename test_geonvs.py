@@ -1069,14 +1069,6 @@ def test_every_landmark_is_another_whole_building(number):
         assert min(data_prep.part_sdf(other, foot)[0] for other in others) < .02
 
 
-@pytest.mark.parametrize("number", [-1, 0, 4])
-def test_a_landmark_fills_the_unit_sphere(number):
-    x = np.random.default_rng(0).uniform(-1.5, 1.5, (60_000, 3))
-    distance = scene_sdf(toy(landmark=number), x, background=False, landmark=number)
-    reach = lengths(x[distance < 0]).max()
-    assert .75 < reach < 1
-
-
 @cases(
     "shape, top, x, distance",
     ground=("ground", 3, (1, 2, .5), .5),
@@ -1099,7 +1091,7 @@ def test_distances_to_parts_equal_closed_forms(shape, top, x, distance):
     alone=(3, dict(background=False)),
     other=(2, dict(landmark=4)),
     facade=(1, dict(landmark=-1)))
-def test_depth_is_where_the_distance_vanishes(i, knobs):
+def test_a_toy_agrees_with_its_distance_function(i, knobs):
     scene = toy(**knobs)
     c2w = scene["c2w"][i]
     d = data_prep.ray_directions(scene["K"][i], c2w, *scene["wh"][i])[::3]
@@ -1109,6 +1101,13 @@ def test_depth_is_where_the_distance_vanishes(i, knobs):
         t += scene_sdf(scene, x, **knobs)
     depth = photo(scene, i, "depth").ravel()[::3]
     assert_arrays_close(np.minimum(t, 6), np.minimum(depth, 6), atol=.01)
+    before = scene["wall"] + .004 * scene["wall_normal"]
+    assert_arrays_close(np.median(scene_sdf(scene, before, **knobs)), .004, atol=1e-4)
+    assert_arrays_close(scene_sdf(scene, scene["near_wall"], **knobs), scene["near_wall_sdf"])
+    assert np.abs(scene["near_wall_sdf"]).max() < .05
+    x = np.random.default_rng(0).uniform(-1.5, 1.5, (60_000, 3))
+    is_landmark = scene_sdf(scene, x, **knobs | dict(background=False)) < 0
+    assert .75 < lengths(x[is_landmark]).max() < 1  # it fills the unit sphere
 
 
 def test_rays_end_on_the_part_they_hit():
@@ -1120,14 +1119,6 @@ def test_rays_end_on_the_part_they_hit():
     distance = [data_prep.part_sdf(parts[i], x[n:n + 1])[0] for n, i in enumerate(which)]
     assert len(np.unique(which)) > 9
     assert_arrays_close(np.array(distance)[t < 20], 0)
-
-
-def test_surface_truth_agrees_with_the_distance_function():
-    scene = toy()
-    before = scene["wall"] + .004 * scene["wall_normal"]
-    assert_arrays_close(np.median(scene_sdf(scene, before)), .004, atol=1e-4)
-    assert_arrays_close(scene_sdf(scene, scene["near_wall"]), scene["near_wall_sdf"])
-    assert np.abs(scene["near_wall_sdf"]).max() < .05
 
 
 def test_the_ground_behind_a_tower_is_darker():
