@@ -146,7 +146,7 @@ def run_command_line(entry, go_on="start again"):
     after a stop."""
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):  # a notebook's streams print any character
-            stream.reconfigure(errors="backslashreplace")  # a terminal's lack some
+            stream.reconfigure(errors="backslashreplace")  # a terminal may lack it
     with on_signals(signal.default_int_handler):
         try:
             entry()
