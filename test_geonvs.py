@@ -1108,6 +1108,7 @@ def test_a_toy_agrees_with_its_distance_function(i, knobs):
     x = np.random.default_rng(0).uniform(-1.5, 1.5, (60_000, 3))
     is_landmark = scene_sdf(scene, x, **knobs | dict(background=False)) < 0
     assert .75 < lengths(x[is_landmark]).max() < 1  # it fills the unit sphere
+    assert np.median(scene["c2w"][:, 1, 3]) < -1  # tourists stand before the front, towards -y
 
 
 def test_rays_end_on_the_part_they_hit():
