@@ -1983,7 +1983,7 @@ def test_outliers_that_the_network_suspects_are_rejected(done, least):
     assert_tensors_close(geonvs.reject_outliers(mask, mask > 0, done), wanted)
 
 
-def test_phi_tells_edges_from_walls_at_any_scale(double):
+def test_phi_is_the_same_at_any_scale(double):
     complexity = random(200)
     opacity = random(200)
     opacity[:50] = 0  # air, whatever its complexity, changes nothing
@@ -3088,7 +3088,8 @@ def test_one_command_trains_scores_and_writes_everything(finished, scene):
     assert set(os.listdir(finished)) == {
         "checkpoint.pt", "log.jsonl", "metrics.json", "codes.npy", "panel.png", "mesh.ply",
         "held_out"}
-    assert sorted(os.listdir(finished / "held_out")) == scene.raw["name"][scene.raw["is_test"]].tolist()
+    held_out = scene.raw["name"][scene.raw["is_test"]].tolist()
+    assert sorted(os.listdir(finished / "held_out")) == held_out
     assert metrics["config"] == asdict(tiny(seed=3, mask="on"))
     assert metrics["energy_wh"] in range(2, 8)  # one at the start, one for each line of the log
     assert metrics["rays_per_second"] == pytest.approx(6 * 64 / metrics["train_seconds"])
