@@ -3933,7 +3933,8 @@ def draw_chart(axis, table):
 
 FEW = dict(rays=64, photos=4, samples=4, bg_samples=6, hidden=16)
 RIVALS = {  # tiny
-    title: row._replace(settings=FEW | dict(rays=256, photos=min(64, row.settings["photos"])))
+    title: row._replace(settings=row.settings | FEW | dict(
+        rays=256, photos=min(64, row.settings["photos"])))
     for title, row in METHODS.items() if issubclass(row.kind, Rival)}
 
 
