@@ -818,7 +818,15 @@ def test_a_photo_is_on_one_side_of_the_split(model, first, second, has_table, to
     scene, out, err = made()
     assert err == (told and f"left out: {told}\n")
     assert len(scene["name"]) == used
-    assert scene["is_test"].sum() == (2 if has_table else 0)  # no eighth can be used
+
+
+def test_the_automatic_split_holds_out_photos_that_can_be_used(in_tmp_dir):
+    write_folder(toy(photos=8))
+    TABLE.unlink()
+    put(IMAGES / "toy_007.png", "no photo")
+    scene, out, err = made()
+    assert scene["name"][scene["is_test"]].tolist() == ["toy_008.png"]
+    assert "left out: toy_007.png" in err
 
 
 @cases(
@@ -1686,6 +1694,20 @@ def test_the_worst_cells_are_split(monkeypatch, capsys):
     assert "near the limit" in capsys.readouterr().out
 
 
+def test_refined_levels_are_alive_at_a_surface():
+    """After two refinements of a sphere hardly a feature weighs less for a corner that hangs."""
+    octree = geonvs.Octree(1.0, 5, root=8)
+    x = 0.6 * F.normalize(random(40000, 3, low=-1))
+    for _ in range(4):
+        node, _, _ = octree.locate(x)
+        octree.split(octree.cells[node[:, -1].unique()], reach=1)
+    node, exists, local = octree.locate(x)
+    weight = geonvs.trilinear_weights(local.flatten(0, 1)).view(-1, 5, 8)
+    alive = (weight * ~octree.is_hanging[node]).sum(2)  # (P,L)
+    assert exists.all()
+    assert (alive.mean(0)[1:] > 0.98).all()
+
+
 @pytest.mark.parametrize("reach", [0, 1, 3])
 def test_cells_are_split_with_the_neighbours_that_exist(reach):
     octree = make_tree()
@@ -1783,6 +1805,29 @@ def test_samples_crowd_at_the_first_surface(warm, double):
     assert 0.7 < ((t - 2.6).abs() < 0.1).float().mean() < 0.9  # the slab begins at 2.6
     assert 0.06 < (t > 3).float().mean() < 0.14
     assert_tensors_close(sample(64000), t)  # not below a voxel
+
+
+@pytest.mark.parametrize("zeta", [20, 480, 1e4])
+def test_the_hit_is_where_a_plane_is(double, zeta):
+    """Within a tenth of the finest step of differences, whatever samples and sharpness."""
+    eps = 1 / geonvs.ROOT / 2**7 / 2  # at eight levels
+    plane = 2.0 + random(200, 1)  # distances along rays
+    t = plane + random(200, 16, low=-0.1, high=0.1).sort().values
+    t[:, [0, -1]] = torch.tensor([1.0, 4.0])
+    sdf = random(200, 1, low=0.3) * (plane - t)
+    w = geonvs.composite(geonvs.neus_alpha(sdf, zeta))
+    assert_tensors_close(geonvs.surface_depth(t, sdf, w), plane[:, 0], eps / 10)
+    assert_tensors_close(geonvs.surface_depth(t, sdf, 0 * w), t[:, -1])
+
+
+@pytest.mark.parametrize("aside, tolerance", [(0.0, 1e-4), (0.3, 3e-4), (0.45, 2e-3)])
+def test_the_hit_is_near_a_sphere(double, aside, tolerance):
+    """Radius 0.5, rays from 2 away that pass its centre at a distance, soft surface."""
+    hit = 2 - (0.5**2 - aside**2) ** 0.5
+    t = hit + (random(200, 24, low=-0.15, high=0.15)).sort().values
+    s = torch.hypot(t - 2, torch.tensor(aside)) - 0.5
+    w = geonvs.composite(geonvs.neus_alpha(s, 80.0))
+    assert_tensors_close(geonvs.surface_depth(t, s, w).median(), hit, tolerance)
 
 
 def plain_sdf(model, x):
@@ -1954,8 +1999,6 @@ def test_a_new_model_shows_a_small_ball(warm, aside, opacity, depth):
     assert_tensors_close(out.opacity, [opacity] * 50, 0.02)
     assert_tensors_close(out.depth, [depth] * 50, 0.02)
     assert_tensors_close(out.rgb, wanted)  # samples lie in the middle of their strata
-    s = warm.signed_distance(hits.x.flatten(0, 1)).view(50, -1)
-    assert (warm.cache.sdf(hits.x) - s).abs().max() < 0.03
 
 
 # ---- 6 photos in the wild ------------------------------------------------------------------------
@@ -1983,13 +2026,19 @@ def test_outliers_that_the_network_suspects_are_rejected(done, least):
     assert_tensors_close(geonvs.reject_outliers(mask, mask > 0, done), wanted)
 
 
-def test_phi_is_the_same_at_any_scale(double):
+def test_phi_tells_edges_from_walls_at_any_scale(double):
     complexity = random(200)
     opacity = random(200)
     opacity[:50] = 0  # air, whatever its complexity, changes nothing
     phi = geonvs.edge_indicator(complexity, opacity)
     wild = torch.where(opacity > 0, 30 * complexity + 0.029, 1e6)  # 30 (x + 0.001)
     assert_tensors_close(geonvs.edge_indicator(wild, opacity), phi)
+    share = phi[50:] / opacity[50:]
+    z = (share / (1 - share)).log()
+    weight = opacity[50:] / opacity.sum()
+    assert_tensors_close((weight * z).sum(), 0.0)
+    assert_tensors_close((weight * z**2).sum(), 1.0)
+    assert (z[complexity[50:].argsort()].diff() > 0).all()
     assert (geonvs.edge_indicator(torch.full((200,), 2.0), opacity) == opacity / 2).all()
     assert (geonvs.edge_indicator(complexity, 0 * opacity) == 0).all()
 
@@ -2023,6 +2072,11 @@ def test_the_model_remembers_errors_of_places_and_cells(warm):
     warm.remember(rays, hits, error)
     assert_tensors_close(octree.cell_error, sums)
     assert_tensors_close(usual.quantile, quantiles)
+    for _ in range(400):
+        warm.remember(rays, hits, error)
+    for cell, group in zip(cells, groups):
+        is_below = error[group] < usual.quantile[cell]
+        assert_tensors_close(is_below.float().mean(), 0.2, 0.02)
 
 
 # ---- 7 model and objective -----------------------------------------------------------------------
@@ -2116,7 +2170,9 @@ def test_the_objective_and_its_gradients_equal_plain_loops(double, mask, zeta, d
     model, rays, photos = rough_case(mask=mask, lam_gpl=0.4, lam_mask=0.7, paper=paper)
     model.deviation.data.fill_(math.log(zeta) / 10)
     model.usual_errors.quantile.uniform_(0, 0.4)
+    model.air = random(*model.air.shape, low=-0.2, high=0.2)  # inside the ball: L_off counts
     plain = plain_losses(model, rays, done)
+    assert plain["off"] > 0
     total, log = model.losses(rays, photos, done, generator())
     for name, value in log.items():
         assert_tensors_close(value, plain[name])
@@ -2192,10 +2248,20 @@ def test_a_model_is_made_of_these_parts(scene, warm, monkeypatch):
     assert geonvs.fit_codes(bare, scene, scene.test).shape == (2, 0)  # nothing is fitted
     assert len(count) == 4  # at most
     assert count[:2].tolist() == [32**3, 64**3]  # one level more is whole
+    far = scene.points[scene.points.norm(dim=1) > 1]
+    node, _, _ = deep.background.octree.locate(geonvs.contract(far))
+    assert (deep.background.octree.cells[node[:, -1], 0] == 3).all()  # fine where points are
     assert len(shallow_count) == 3
     assert shallow_count[1] < 64**3
     assert deep.eps == 2 / 16 / 4 / 2  # half of the smallest cell there is
     make_cache.assert_called_once_with(128)
+
+
+def test_a_model_starts_as_a_small_sphere(warm):
+    x = 0.57 * random(5000, 3, low=-1)  # a cube in the sphere
+    s = warm.signed_distance(x)
+    assert (s - x.norm(dim=1) + 0.25).square().mean().sqrt() < 0.03
+    assert (warm.cache.sdf(x[None])[0] - s).abs().max() < 0.03
 
 
 @pytest.mark.parametrize("done, least", [(0.0, 1e-6), (0.1, 20), (0.2, 40), (0.4, 80), (1.0, 80)])
@@ -2280,7 +2346,10 @@ def train_on_meta(model, monkeypatch):
     monkeypatch.setattr(adam, "_device_dtype_check_for_fused", mock.Mock())
     scene = [x.to("meta") if torch.is_tensor(x) else x for x in model.scene]
     model.scene = geonvs.Scene(*scene)
-    optimizer = geonvs.make_optimizer(model.to("meta"))
+    for module in model.to("meta").modules():
+        tensors = filter(torch.is_tensor, vars(module).values())
+        assert all(tensor.is_meta for tensor in tensors)
+    optimizer = geonvs.make_optimizer(model)
     with OneDevice():
         for step, done in ((0, 0.1), (64, 0.7)):
             geonvs.training_step(model, optimizer, step, done, MetaGenerator())
@@ -2857,9 +2926,11 @@ def test_a_model_that_knows_photos_scores_perfectly(knowing, scene):
         per_image=[], psnr=None, psnr_floor=None, ssim=None, lpips=None, masked_pixels=None)
 
 
-def test_infinite_colours_are_no_picture(knowing, scene):
+@pytest.mark.parametrize("paper, says", [("", "finite: "), ("alpha", "printed equations may")])
+def test_infinite_colours_are_no_picture(knowing, scene, paper, says):
+    knowing.cfg.paper = paper
     knowing.render = lambda rays, code: picture(code[:, :3])
-    with pytest.raises(UserError, match="finite"):
+    with pytest.raises(UserError, match=says):
         geonvs.render_photo(knowing, scene, 1, torch.tensor([0.5, 0.5, math.nan, 0.0]))
 
 
