@@ -33,20 +33,23 @@ Conventions
             finite differences; lap Laplacian; E_grad = (|grad s| - 1)^2; E_curv = |lap s| h,
             h is eps in L_curv, a voxel's side in Phi [D2]
   shapes    R rays, S intervals of a ray (S + 1 samples), J intervals or points on a ray, P points,
-            N octree cells, L octree levels, C channels per level, V feature rows, G inputs of the
-            colour network from geometry, A appearance dims, I photos in all, B of them in a batch,
-            Q SfM points, T sightings, m side of a mask, n: see the line, "." any length
+            K background samples of a ray, N octree cells, L octree levels, C channels per level,
+            V feature rows, G inputs of the colour network from geometry, A appearance dims,
+            I photos in all, B of them in a batch, Q SfM points, T sightings, m side of a mask,
+            n: see the line, "." any length
 
 Departures from the printed paper. The tag stands at the code; .github/RESULTS.md has figures.
   tag   in the paper                   here                              because
-  [D1]  alpha: a difference of         NeuS's Eq. 13, with s at both     printed, a surface lets 37
-        sigmoids with a slope beta     ends of an interval               percent of the light pass
+  [D1]  alpha: a difference of         NeuS's Eq. 13, with s at both     printed, 37 % of the light
+        sigmoids with a slope beta     ends of an interval               passes through a surface
   [D2]  E_curv = |lap s|; Phi on       |lap s| h, h being the step of    |lap s| grows as h shrinks;
         every ray                      the difference; L_eik, L_curv,    rays through air have no
                                        Phi are weighted by opacity       edges
-  [D3]  L_reg: intensity and           M classifies rays by their error  printed, M masks skies;
-        bimodality of M, which L_rgb   at a place; early outliers are    later it would lose people
-        trains, too                    rejected; M is fixed at 60 %      that the scene memorised
+  [D3]  L_reg: penalties of            M is trained to classify rays     as printed, M masks skies;
+        intensity and bimodality of    by error, the threshold depends   errors are large at first,
+        M, which L_rgb trains, too     on the place; outliers are        and small at last, where
+                                       rejected at first; M is fixed     people have been memorised
+                                       at 60 % of training
   [D4]  CGNet                          a block a stage, GroupNorm, a     photos are small, eight in
                                        head at each resolution           a batch
   [D5]  a sphere loss in a warm-up     SfM points place the sphere and   else remnants of the ball
@@ -57,9 +60,9 @@ Departures from the printed paper. The tag stands at the code; .github/RESULTS.m
                                        see the normal; samples and Phi   normal
                                        read a cached SDF, so L_GPL
                                        moves M alone
-  [D7]  octrees are pruned             cells split where colours err;    cells that are never made
-                                       what a scene does not need is     need no pruning
-                                       off
+  [D7]  octrees are pruned             cells split where colour errors   cells that are never made
+                                       are large; codes or background    need no pruning
+                                       are off where not needed
   [D8]  zeta is learned                above a bound that rises          else surfaces stay soft
                                                                          where photos are few
 """
@@ -152,7 +155,7 @@ class Config:
         for option in fields(self):
             value = getattr(self, option.name)
             least = option.metadata.get("least", 0)
-            choices = option.metadata.get("choices", [value])  # without choices any value is one
+            choices = option.metadata.get("choices", [value])  # no choices: the value passes
             words = ", ".join(map(str, choices))
             check(value in choices, f"--{option.name} {value} is unknown: use one of {words}")
             check(option.type is str or least <= value < 2**31,
@@ -300,7 +303,7 @@ class Rays(NamedTuple):
     is_masked: Tensor  # (R,) whether a user's mask file excludes the pixel
 
     def at(self, t):
-        """Points (R,S,3) at distances t (R,S)."""
+        """Points (R,S,3) at distances t (R,S): o + t d in one operation."""
         return torch.addcmul(self.o[:, None], t[..., None], self.d[:, None])
 
 
@@ -415,11 +418,12 @@ def grid_index(n, device):
 
 
 def pack_index(index, base=2**13):
-    """An index of integers (...,d), each below base, as one integer (...). For a cell or corner
-    (level, i, j, k) it is the key that the octree finds it by."""
+    """An index of integers (...,d), each below base, as one integer (...): they are its digits. For
+    a cell or corner (level, i, j, k) it is the key that the octree finds it by; 2^13 is more than
+    the 2,049 corners along an axis of the finest level."""
     key = index[..., 0]
     for digit in index[..., 1:].unbind(-1):
-        key = torch.add(digit, key, alpha=base)  # digit + base key
+        key = torch.add(digit, key, alpha=base)  # base key + digit, in one operation
     return key
 
 
@@ -471,38 +475,46 @@ class Octree(nn.Module):
         key = key[torch.isin(key, pack_index(self.cells))]  # a neighbour may not exist
         return self.build(torch.cat([self.split_keys, key]).unique())
 
+    def make_tree(self, split_keys):
+        """Cells (N,4), level after level, and the row of each cell's first child (N,), 0 if it has
+        none. The eight children of a cell are neighbours in the list, in the order of octants."""
+        octants = grid_index(2, split_keys.device)  # (8,3)
+        index = grid_index(self.root, split_keys.device)  # (.,3) cells of a level
+        cells = []
+        is_split = []
+        for level in range(self.levels):
+            cells.append(F.pad(index, (1, 0), value=level))  # (.,4) level, i, j, k
+            is_split.append(torch.isin(pack_index(cells[level]), split_keys))  # (.,)
+            parents = index[is_split[level]]
+            index = (2 * parents[:, None] + octants).flatten(0, 1)
+        cells = torch.cat(cells)
+        is_split = torch.cat(is_split)  # (N,)
+        # Level 0 fills the first root^3 rows. Children follow in the order of their parents: split
+        # cell number n, counted from 0, has the eight rows from root^3 + 8 n on.
+        first_child = self.root**3 + 8 * (is_split.cumsum(0) - 1)  # (N,)
+        return cells, first_child * is_split
+
     def build(self, split_keys):
         """Makes cells and corners, given the keys of all cells that are split. Rows of corners that
         were there before keep their features, new ones are zero. Returns which rows (V,) are old;
         they keep their order."""
-        device = split_keys.device
-        octants = grid_index(2, device)  # (8,3)
-        index = grid_index(self.root, device)  # (N,3) cells of a level
-        cells = []
-        is_split = []
-        for level in range(self.levels):
-            cells.append(F.pad(index, (1, 0), value=level))  # (N,4) level, i, j, k
-            is_split.append(torch.isin(pack_index(cells[level]), split_keys))  # (N,)
-            parents = index[is_split[level]]
-            index = (2 * parents[:, None] + octants).flatten(0, 1)  # in the order of octants
-        # levels follow one another in cells: the k-th split cell has the k-th eight children
-        cells = torch.cat(cells)
-        is_split = torch.cat(is_split)
-        first_child = self.root**3 + 8 * (is_split.cumsum(0) - 1)  # (N,)
-        # keys add up as indices do: (N,8)
-        corners = pack_index(cells)[:, None] + pack_index(F.pad(octants, (1, 0)))
+        cells, child = self.make_tree(split_keys)
+        octants = grid_index(2, split_keys.device)  # (8,3)
+        # a corner is its cell's index plus an octant; the key of a sum is the sum of the keys
+        corners = pack_index(cells)[:, None] + pack_index(F.pad(octants, (1, 0)))  # (N,8)
         key, corner, cells_around = corners.unique(return_inverse=True, return_counts=True)  # (.,)
         has_feature = cells_around == 8
-        row = (has_feature.cumsum(0) - 1).clamp_min(0)  # feature row of a corner; unused if hanging
+        # rows are counted over corners with a feature; a hanging one has any row, with weight 0
+        row = (has_feature.cumsum(0) - 1).clamp_min(0)
         key = key[has_feature]  # (V,)
         is_old = torch.isin(key, self.corner_key)
 
-        # of these buffers a checkpoint holds split_keys and cell_error, from which the rest follows
+        # the state has features and cell_error, save() adds split_keys; the rest follows from these
         self.split_keys = nn.Buffer(split_keys, persistent=False)
         self.corner_key = nn.Buffer(key, persistent=False)  # (V,) sorted, the corner of each row
         self.features = nn.Parameter(carry_over_rows(self.features, is_old))
         self.cells = nn.Buffer(cells, persistent=False)  # (N,4) level, i, j, k
-        self.child = nn.Buffer((first_child * is_split).int(), persistent=False)  # (N,) 0: none
+        self.child = nn.Buffer(child.int(), persistent=False)  # (N,) 0: none
         self.corner = nn.Buffer(row[corner].int(), persistent=False)  # (N,8) rows
         self.is_hanging = nn.Buffer(~has_feature[corner], persistent=False)  # (N,8)
         # (N,3) sums over rays that hit a cell: of errors, of pixel sizes there, their number
@@ -515,9 +527,10 @@ class Octree(nn.Module):
         x down to that level; whether the level has a cell there (P,L); the position in it, 0..1
         (P,L,3). An x outside the cube is moved to its border."""
         x = 0.5 + x * (0.5 / self.half)  # (P,3) over the cube
-        x = x.clamp(0, 1 - 1e-6).nan_to_num()  # a run that diverges ends in check_finite
+        x = x.clamp(0, 1 - 1e-6).nan_to_num()  # an index needs a number; check_finite tells later
         x = x[:, None] * self.resolution[:, None]  # (P,L,3) in cells
         index = x.long()  # (P,L,3)
+        # the last bit of i, j, k says in which half of its parent a cell lies
         octants = pack_index(index & 1, base=2)  # (P,L)
         node = pack_index(index[:, 0], base=self.root)  # (P,) of level 0
         nodes = [node]
@@ -571,16 +584,17 @@ def cells_to_split(octree):
     all errors. A cell is split only if its children are larger than a pixel. Errors are recorded in
     cells that are not split. [D7]"""
     level = octree.cells[:, 0]  # (N,)
-    error, pixel, count = octree.cell_error.T  # (N,) sums over rays
-    is_coarse = pixel < count * octree.side[level] / 2  # mean size of a pixel under a child's side
+    error_sum, pixel_sum, count = octree.cell_error.T  # (N,) over rays
+    # the mean size of a pixel, pixel_sum / count, is less than a child's side
+    is_coarse = pixel_sum < count * octree.side[level] / 2
     can_split = is_coarse & (level < octree.levels - 1)
-    error, worst = (error * can_split).sort(descending=True)  # (N,)
+    error, order = (error_sum * can_split).sort(descending=True)
     error_before = error.cumsum(0) - error  # (N,) in worse cells
     is_chosen = error_before < SPLIT_SHARE * error.sum()
     room = max(MAX_CELLS - len(level), 0) // (7 * 8)  # six neighbours are split with each
     if is_chosen.sum() > room:
         print(f"  {len(level)} octree cells near the limit of {MAX_CELLS}: fewer are split")
-    return octree.cells[worst[is_chosen][:room]]
+    return octree.cells[order[is_chosen][:room]]
 
 
 # ---- 4 Fields: the networks on top of the octree -------------------------------------------------
@@ -629,7 +643,8 @@ def finite_differences(s, taps, eps):
     """Gradient (P,3) and Laplacian (P,) of a field from its values s (P,5) at x + eps taps: x
     itself, then the corners of a tetrahedron (Neuralangelo's code; its paper has six)."""
     grad = 3 / (4 * eps) * (s @ taps)  # (P,3) as the sum of k k^T over corners k is 4/3 I
-    # the mean over the four corners is s + eps^2 lap / 6; s itself is one of five values here
+    # The mean m over the four corners is s + eps^2 lap / 6. The mean over all five values is
+    # (s + 4 m) / 5, so m - s is 5/4 of that mean less s.
     lap = 6 / eps**2 * 5 / 4 * (s.mean(1) - s[:, 0])
     return grad, lap
 
@@ -722,10 +737,10 @@ def paper_alpha(sdf, zeta):
 
 
 def composite(alpha):
-    """Eq. 2: weights w_i = T_i alpha_i (R,S) with T_i = prod_{j<i} (1 - alpha_j). As a sum of logs,
-    in which the transmittance of an opaque interval counts as 1e-6: the sum of w can exceed 1 by
-    as much."""
-    log_pass = torch.log1p((1e-6 - 1) * alpha)  # (R,S) log of 1 - alpha, or 1e-6
+    """Eq. 2: weights w_i = T_i alpha_i (R,S) with T_i = prod_{j<i} (1 - alpha_j). The product is
+    the exponential of a sum of logs. For these to be finite, 1 - (1 - 1e-6) alpha stands for
+    1 - alpha: an opaque interval passes 1e-6, and weights can sum to 1 + 1e-6."""
+    log_pass = torch.log1p(-(1 - 1e-6) * alpha)  # (R,S) log(1 - alpha), finite
     trans = torch.exp(log_pass.cumsum(1) - log_pass)  # (R,S) T_i
     return trans * alpha
 
@@ -774,10 +789,10 @@ class SDFCache(nn.Module):
         self.inside = nn.Buffer(inside, persistent=False)
         self.points = nn.Buffer(voxels[inside], persistent=False)  # (P,3)
 
-    def refresh(self, sdf):
-        """Evaluates sdf, (P,3) to (P,), again at all voxels in the sphere."""
-        s = self.volume[0, 0].flatten()  # (n^3,)
-        s[self.inside] = in_chunks(sdf, self.points)
+    def refresh(self, signed_distance):
+        """Evaluates signed_distance, (P,3) to (P,), again at all voxels in the sphere."""
+        s = self.volume[0, 0].flatten()  # (n^3,) a view of the volume
+        s[self.inside] = in_chunks(signed_distance, self.points)
         s = s.view(self.n, self.n, self.n)
         self.volume[0] = torch.stack([s, *central_differences(s)])
 
@@ -815,56 +830,60 @@ def contract(x):
 
 class Background(nn.Module):
     """A small NeRF before and beyond the sphere, on an octree over contracted space."""
-    def __init__(self, points, hidden, per_ray, levels, samples):
+    def __init__(self, points, hidden, per_ray_dim, levels, samples):
         super().__init__()
         self.samples = samples
         self.octree = Octree(2.0, levels, root=32)  # cells of 1/8
         seed_octree(self.octree, contract(points), dense=levels - 3)  # points (P,3)
         self.density = mlp(3 + self.octree.width, hidden, 1 + GEOMETRY_FEATURES)
-        self.color = mlp(GEOMETRY_FEATURES + per_ray, hidden, 3)
+        self.color = mlp(GEOMETRY_FEATURES + per_ray_dim, hidden, 3)
+
+    def sample(self, rays, t0, t1, gen=None):
+        """Distances (R,K) of the samples around the sphere, which rays enter at t0 (R,1) and leave
+        at t1; lengths (R,K-1) of the intervals that begin there; how many samples lie before the
+        sphere, between near and t0. The others lie at t1 + u / (1 - u), u in 0..1, to reach far."""
+        n = self.samples // 6  # little stands before a landmark
+        near = rays.near.lerp(t0, stratified(rays, n, gen))  # (R,n)
+        u = stratified(rays, self.samples - n, gen)  # (R,K-n)
+        far = u / (1 - u).clamp_min(1e-3)  # (R,K-n) at most 1,000 radii
+        near_length = torch.cat([near, t0], 1).diff()  # (R,n) the last one ends at the sphere
+        length = torch.cat([near_length, far.diff()], 1)  # (R,K-1)
+        return torch.cat([near, t1 + far], 1), length, n
 
     def forward(self, rays, t0, t1, per_ray, gen=None):
-        """What lies around the sphere, which rays enter at t0 (R,1) and leave at t1. per_ray:
-        (R,3+A) direction and code. Returns the colour (R,3) of what lies before t0, the share (R,1)
-        of light that passes it, the colour (R,3) beyond t1, dimmed by what lies before t0, and the
-        mean position (R,3) there, in contracted space, without gradient. The first sixth of the
-        samples is stratified up to t0. The others lie u / (1 - u) behind t1, where u is stratified.
-        The last one is opaque."""
-        n = self.samples // 6
-        before = rays.near.lerp(t0, stratified(rays, n, gen))  # (R,n)
-        u = stratified(rays, self.samples - n, gen)  # (R,S-n)
-        beyond = u / (1 - u).clamp_min(1e-3)  # (R,S-n) at most 1,000 radii
-        length_before = torch.cat([before, t0], 1).diff()  # (R,n)
-        length = torch.cat([length_before, beyond.diff()], 1)  # (R,S-1)
-        t = torch.cat([before, t1 + beyond], 1)  # (R,S)
-        x = contract(rays.at(t))  # (R,S,3)
-        inputs = torch.cat([x, self.octree(x)], 2)  # (R,S,3+LC)
-        out = mixed_precision(self.density, inputs)  # (R,S,1+GEOMETRY_FEATURES)
+        """What rays see around the sphere, between t0 and t1 (R,1). per_ray: (R,3+A) direction and
+        code. Returns the colour (R,3) of what lies before the sphere and the share (R,1) of light
+        that passes it; the colour (R,3) beyond the sphere, already dimmed by that share; the mean
+        position (R,3) there, in contracted space, without gradient."""
+        t, length, n = self.sample(rays, t0, t1, gen)
+        x = contract(rays.at(t))  # (R,K,3)
+        inputs = torch.cat([x, self.octree(x)], 2)  # (R,K,3+LC)
+        out = mixed_precision(self.density, inputs)  # (R,K,1+GEOMETRY_FEATURES)
         sigma, geo = out.split([1, GEOMETRY_FEATURES], 2)
-        sigma = F.softplus(sigma[..., 0] - 1)  # (R,S) starts at 0.31
-        alpha = 1 - torch.exp(-sigma[:, :-1] * length)  # (R,S-1)
-        w = composite(F.pad(alpha, (0, 1), value=1.0))  # (R,S)
-        colors = w[..., None] * colors_of(self.color, geo, per_ray)  # (R,S,3)
-        color_before = colors[:, :n].sum(1)  # (R,3)
-        color_beyond = colors[:, n:].sum(1)  # (R,3)
-        passed = 1 - w[:, :n].sum(1, keepdim=True)  # (R,1)
-        w_beyond = F.normalize(w[:, n:].detach(), p=1, dim=1)
-        place = torch.einsum("rs,rsc->rc", w_beyond, x[:, n:])
-        return color_before, passed, color_beyond, place
+        sigma = F.softplus(sigma[..., 0] - 1)  # (R,K) starts at 0.31
+        alpha = 1 - torch.exp(-sigma[:, :-1] * length)  # (R,K-1)
+        w = composite(F.pad(alpha, (0, 1), value=1.0))  # (R,K) the last sample is opaque
+        colors = w[..., None] * colors_of(self.color, geo, per_ray)  # (R,K,3)
+        near_color = colors[:, :n].sum(1)  # (R,3)
+        far_color = colors[:, n:].sum(1)  # (R,3)
+        near_transmittance = 1 - w[:, :n].sum(1, keepdim=True)  # (R,1)
+        far_w = F.normalize(w[:, n:].detach(), p=1, dim=1)
+        place = torch.einsum("rk,rkc->rc", far_w, x[:, n:])
+        return near_color, near_transmittance, far_color, place
 
 
 def surface_depth(t, sdf, w):
     """Distance (R,) to the surface on rays with samples at t (R,S+1), SDF (R,S+1) and weights w
-    (R,S) of the intervals between them. Each interval votes, with its weight, for the place where
-    the line through s at its two ends is zero: exact for planes. On a curved surface the lines of
-    other intervals miss the zero. So all but those that lead from outside to inside have a
-    hundredth of the vote. Where nothing has weight, the last sample counts."""
+    (R,S) of the intervals between them: the weighted mean, over intervals, of the place where the
+    line through s at the interval's two ends is zero. Along a ray through a plane s is a line, so
+    all intervals agree. On a curved surface only an interval whose ends have different signs is
+    right, so the others count a hundredth. A ray without weight gets the last sample."""
     start, end = sdf[:, :-1], sdf[:, 1:]
     fraction = start / (start - end).clamp_min(1e-6)  # (R,S) of the interval, up to the zero
     zero = torch.lerp(t[:, :-1], t[:, 1:], fraction)
     zero = zero.clamp(t[:, :1], t[:, -1:])
-    w = torch.where((start > 0) & (end <= 0), w, 0.01 * w)
-    return ((w * zero).sum(1) + 1e-8 * t[:, -1]) / (w.sum(1) + 1e-8)
+    vote = torch.where((start > 0) & (end <= 0), w, 0.01 * w)  # (R,S)
+    return ((vote * zero).sum(1) + 1e-8 * t[:, -1]) / (vote.sum(1) + 1e-8)
 
 
 class Hits(NamedTuple):
@@ -875,7 +894,7 @@ class Hits(NamedTuple):
     opacity: Tensor  # (R,) of the foreground
     depth: Tensor  # (R,) distance to the surface; t1 if none is met
     point: Tensor  # (R,3) the surface point
-    around: Tensor  # (R,3) colour of what lies before and beyond the sphere, as it is seen
+    around: Tensor  # (R,3) colour that the background adds, before and beyond the sphere
     place: Tensor  # (R,3) where the ray ends, in contracted space: point, or the background's place
 
 
@@ -905,11 +924,10 @@ def complexity(e_grad, e_curv):
 
 
 def edge_indicator(ray_complexity, opacity):
-    """Phi (R,), Eq. 4: a calibrated sigmoid of the complexity, times opacity. The paper does not
-    say how it is calibrated. Here the logarithm of the complexity is standardised by its mean and
-    deviation over the foreground of the step's rays, so that Phi tells edges from flat walls at any
-    scale. A ray through air has no edge, hence the opacity (R,), 0 for rays that do not count.
-    [D2]"""
+    """Phi (R,), Eq. 4: opacity times sigmoid((log K - mean) / deviation), K being the complexity.
+    The paper calibrates its sigmoid, but does not say how. Here mean and deviation are those of the
+    step's rays, weighted by opacity, so that Phi tells edges from flat walls at any scale. A ray
+    through air has no edge, hence the opacity (R,), 0 for rays that do not count. [D2]"""
     weight = opacity / opacity.sum().clamp_min(1e-6)  # (R,)
     x = (ray_complexity + 1e-3).log()
     mean = (weight * x).sum()
@@ -931,29 +949,28 @@ def gpl_loss(mask, phi):
 
 
 def mask_loss(logit, excess):
-    """L_reg: binary cross entropy that classifies rays (R,) by their error. A ray whose error
-    exceeds its threshold (excess > 0) is trained towards M = 1, any other towards M = 0, weighted
-    by |excess|. For a single ray the best M is 1 if its error exceeds the threshold, else 0, as
-    for the simpler (1 - M) error + M threshold, whose gradient vanishes where the sigmoid
-    saturates. With L_GPL the best M is min(1, excess / (0.05 Phi)): only errors that exceed the
-    threshold by 0.05 mask an edge fully. [D3]"""
+    """L_reg: binary cross entropy that classifies rays (R,). The label of a ray is 1 if its error
+    exceeds its threshold (excess > 0), else 0; its weight is |excess|. For a ray by itself the best
+    M is the label. The simpler loss (1 - M) error + M threshold has the same minimum, but no
+    gradient where the sigmoid saturates. L_GPL moves the best M of an outlier to
+    min(1, excess / (0.05 Phi)): an edge is masked fully only if excess is at least 0.05. [D3]"""
     is_transient = (excess > 0).float()
     return F.binary_cross_entropy_with_logits(logit, is_transient, excess.abs())
 
 
 def paper_mask_loss(mask, error):
     """L_reg as the paper describes it: -M error for what M takes out of L_rgb (here the error of
-    the worst channel), and penalties for intensity and bimodality in CR-NeRF's forms; the paper
-    prints neither forms nor weights. M minimises it at (error - 0.02) / 0.26. L_GPL subtracts
-    0.05 Phi from the error, so it lowers M by 0.19 at most."""
+    the worst channel), and penalties for intensity and bimodality. The paper prints neither forms
+    nor weights: the forms are CR-NeRF's, the weights 0.15 and 0.02 ours. The best M of a ray is
+    (error - 0.02) / 0.26. L_GPL subtracts 0.05 Phi from the error: it lowers M by at most 0.19."""
     return (0.15 * mask**2 + 0.02 * mask * (1 - mask) - mask * error).mean()
 
 
 def reject_outliers(mask, is_outlier, done):
-    """M (R,) with outliers, rays whose error exceeds the threshold, set to 1 where M exceeds a
-    bar. The bar rises from 0 to 1 over the first REJECTION of training; then nothing is rejected.
-    So at first the scene learns from the rays below their thresholds alone. The thresholds grow
-    where all rays err. Later the scene must learn its own details. [D3]"""
+    """M (R,) with 1 for rejected outliers. An outlier is a ray whose error exceeds its threshold.
+    It is rejected if M exceeds a bar. At first the bar is 0, so every outlier is rejected. What the
+    scene has not learnt yet errs in all photos, which raises the threshold of its place, so it is
+    not rejected for long. The bar reaches 1 at REJECTION of training; then M alone decides. [D3]"""
     bar = (done / REJECTION) ** 2  # squared: it rises late
     return torch.where(is_outlier & (mask > bar), 1.0, mask)
 
@@ -1107,7 +1124,7 @@ class GeoNVS(nn.Module):
 
         octree = Octree(1.0, levels)
         seed_octree(octree, self.sfm, dense=0)
-        self.octrees = [octree]  # a list: the fields own them
+        self.octrees = [octree]  # a plain list, as the fields own them
         self.sdf = SDFField(octree, cfg.hidden)
         self.color = nn.Sequential(
             LipschitzLinear(GEOMETRY_FEATURES + octree.width + 3 + 3 + A, cfg.hidden),
@@ -1149,7 +1166,7 @@ class GeoNVS(nn.Module):
         people and clouds of a single photo. Their errors are then small, so the mask misses them,
         and the surface stays soft. [D8]"""
         if not self.cfg.printed("zeta"):
-            least = LEAST_ZETA * min(done / ZETA_RISE, 1) + 1e-6
+            least = LEAST_ZETA * min(done / ZETA_RISE, 1) + 1e-6  # 0 has no logarithm
             self.deviation.data.clamp_min_(math.log(least) / 10)
 
     def alpha(self, sdf, max_zeta=math.inf):
@@ -1164,10 +1181,11 @@ class GeoNVS(nn.Module):
     @torch.no_grad()
     def sample(self, rays, t0, t1, gen=None):
         """Distances (R,S+1) of the samples between t0 and t1 (R,1), dense where the cache sees a
-        surface, which is taken to be at least half a voxel wide."""
+        surface. The cache cannot show one that is thinner than half a voxel."""
         even = torch.linspace(0, 1, PROBES + 1, device=t0.device)
         probes = t0.lerp(t1, even)  # (R,PROBES+1)
-        alpha = self.alpha(self.cache.sdf(rays.at(probes)), max_zeta=self.cache.n)
+        sdf = self.cache.sdf(rays.at(probes))  # (R,PROBES+1)
+        alpha = self.alpha(sdf, max_zeta=self.cache.n)  # so 1 / zeta is at least half a voxel
         return importance_samples(probes, alpha, stratified(rays, self.cfg.samples - 1, gen))
 
     def trace(self, rays, code, gen=None):
@@ -1185,15 +1203,16 @@ class GeoNVS(nn.Module):
         # the sample at either end [D1]
         w = F.avg_pool1d(interval_w, 2, stride=1, padding=1)  # (R,S+1)
 
-        before = 0  # nothing stands there
-        beyond = self.bg_color  # (3,)
-        bg_place = 2 * rays.d  # (R,3) infinity
+        near_color = 0  # nothing stands before the sphere
+        far_color = self.bg_color  # (3,)
+        far_place = 2 * rays.d  # (R,3) infinity
         if self.background:
             per_ray = torch.cat([rays.d, code], 1)  # (R,3+A)
-            before, passed, beyond, bg_place = self.background(rays, t0, t1, per_ray, gen)
-            w = passed * w
-        around = before + (1 - opacity[:, None]) * beyond  # (R,3)
-        place = torch.where(opacity[:, None] > 0.5, point, bg_place)
+            near_color, near_transmittance, far_color, far_place = self.background(
+                rays, t0, t1, per_ray, gen)
+            w = near_transmittance * w
+        around = near_color + (1 - opacity[:, None]) * far_color  # (R,3)
+        place = torch.where(opacity[:, None] > 0.5, point, far_place)
         return Hits(x, geo, w, opacity, depth, point, around, place)
 
     def shade(self, rays, code, hits, normal):
@@ -1205,16 +1224,14 @@ class GeoNVS(nn.Module):
 
     def losses(self, rays, photos, done, gen):
         """The objective of rays that come photo by photo, equally many of each of photos (B,);
-        done: share of training, 0..1. Returns the total, and a dictionary for the log. Remembers
-        what refinement and the mask's threshold depend on."""
+        done: share of training, 0..1. Returns the total, and a dictionary for the log. Side effect:
+        update_statistics."""
         cfg = self.cfg
         R = len(rays.o)
         code = self.appearance(photos).repeat_interleave(R // len(photos), 0)  # (R,A)
         hits = self.trace(rays, code, gen)
-        n = math.ceil(R / 4)  # SfM points, and points in air
-        sfm = self.sfm[random_index(gen, len(self.sfm), n)]  # (n,3)
-        start, end = self.air[random_index(gen, len(self.air), n)].unbind(1)  # (n,3)
-        air = start.lerp(end, uniform(gen, n, 1))  # (n,3)
+        n = math.ceil(R / 4)
+        sfm, air = self.known_points(n, gen)  # (n,3), (n,3)
         points = torch.cat([hits.point, sfm, air])  # (R+2n,3), looked up at once [D6]
         s, grad, lap = self.sdf.derivatives(points, self.eps)  # (R+2n,), (R+2n,3), (R+2n,)
         opacity = hits.opacity.detach()
@@ -1227,7 +1244,7 @@ class GeoNVS(nn.Module):
         left_out, reg, gpl = self.transients(rays, photos, hits.place, phi, error, done)
         pull = self.zeta().detach().clamp_max(MAX_PULL)  # at first s must be free to change [D5]
         _, s_sfm, s_air = s.split([R, n, n])
-        margin = min(self.sdf.octree.finest, AIR_GAP)
+        margin = min(self.sdf.octree.finest, AIR_GAP)  # s can be AIR_GAP at the end of a segment
         loss = dict(
             rgb=((1 - left_out) * residual.mean(1)).mean(),  # [D3]
             eik=(eik_weight * eikonal(grad)).mean(),
@@ -1237,11 +1254,18 @@ class GeoNVS(nn.Module):
             lps=lipschitz_loss(self.color),
             off=pull * off_surface_loss(s_air, margin),  # [D5]
             sfm=pull * s_sfm.abs().mean())  # [D5]
-        self.remember(rays, hits, error)
+        self.update_statistics(rays, hits, error)
         log = loss | dict(
             mse=residual.square().mean(),
             left_out=left_out.mean())
         return objective(loss, cfg), log
+
+    def known_points(self, n, gen):
+        """n random SfM points, where s is 0, and n random points in air, where s is positive: (n,3)
+        each. [D5]"""
+        sfm = self.sfm[random_index(gen, len(self.sfm), n)]  # (n,3)
+        start, end = self.air[random_index(gen, len(self.air), n)].unbind(1)  # (n,3)
+        return sfm, start.lerp(end, uniform(gen, n, 1))
 
     def phi(self, rays, hits):
         """Phi (R,) of rays with hits, 0 where a user's mask excludes the pixel. Eq. 4"""
@@ -1249,7 +1273,8 @@ class GeoNVS(nn.Module):
         e_grad, e_curv = self.cache.errors(hits.x)  # (R,)
         if self.cfg.printed("phi"):
             is_inside = hits.x[:, 0].norm(dim=1) < 1.001  # not if a ray misses the sphere
-            ray_complexity = complexity(e_grad, e_curv / self.cache.side) * is_inside
+            e_curv = e_curv / self.cache.side  # as printed: |lap s| without h
+            ray_complexity = complexity(e_grad, e_curv) * is_inside
             return paper_phi(ray_complexity) * is_counted
         return edge_indicator(complexity(e_grad, e_curv), hits.opacity.detach() * is_counted)
 
@@ -1274,7 +1299,7 @@ class GeoNVS(nn.Module):
             left_out = reject_outliers(M.detach(), excess > 0, done)
         return left_out.masked_fill(rays.is_masked, 1), reg, gpl_loss(M, phi)
 
-    def remember(self, rays, hits, error):
+    def update_statistics(self, rays, hits, error):
         """Follows the errors (R,) of a step's rays: for the mask's threshold those of a place, for
         refinement those of the octree's cells at surface points, people's among them. [D3] [D7]"""
         self.usual_errors.update(hits.place, error, ~rays.is_masked)
@@ -1292,10 +1317,10 @@ class GeoNVS(nn.Module):
 
     def batch(self, n, gen):
         """n random rays and the photos (B,) they come from, photo by photo."""
-        photos = self.scene.train
-        picked = photos[random_index(gen, len(photos), self.cfg.photos)]  # (B,)
-        photo = picked.repeat_interleave(n // len(picked))  # (R,)
-        return random_rays(self.scene, photo, gen), picked
+        train = self.scene.train
+        photos = train[random_index(gen, len(train), self.cfg.photos)]  # (B,)
+        photo = photos.repeat_interleave(n // len(photos))  # (R,)
+        return random_rays(self.scene, photo, gen), photos
 
     def groups(self):
         """Optimiser groups with their learning rates: networks, grids, codes, mask."""
@@ -1395,8 +1420,8 @@ def training_step(model, optimizer, step, done, gen, processes=ALONE):
     if step % CACHE_EVERY == 0:
         model.refresh_cache()
     model.raise_zeta(done)
-    rays, picked = model.batch(model.cfg.rays, gen)
-    loss, terms = model.losses(rays, picked, done, gen)
+    rays, photos = model.batch(model.cfg.rays, gen)
+    loss, terms = model.losses(rays, photos, done, gen)
     optimizer.zero_grad()
     loss.backward()
     processes.average_gradients(model)

@@ -2069,11 +2069,11 @@ def test_the_model_remembers_errors_of_places_and_cells(warm):
     for cell, group in zip(cells, groups):
         push = 0.2 - (error[group] < 0.1).float()
         quantiles[cell] *= torch.exp(0.1 * push.mean())
-    warm.remember(rays, hits, error)
+    warm.update_statistics(rays, hits, error)
     assert_tensors_close(octree.cell_error, sums)
     assert_tensors_close(usual.quantile, quantiles)
     for _ in range(400):
-        warm.remember(rays, hits, error)
+        warm.update_statistics(rays, hits, error)
     for cell, group in zip(cells, groups):
         is_below = error[group] < usual.quantile[cell]
         assert_tensors_close(is_below.float().mean(), 0.2, 0.02)
