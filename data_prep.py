@@ -970,6 +970,8 @@ def open_scene(name_or_folder, downscale=2):
         is_gone = not os.path.isdir(info["folder"])
         if info["downscale"] == downscale and (is_gone or info["files"] == fingerprint(info)):
             return scene
+        check(not is_gone, f"{path} has --downscale {info['downscale']} and its photos are gone: "
+              "give that")
     print(f"making {path}")
     scene = make_toy() if name_or_folder == "toy" else prepare(name_or_folder, downscale, split)
     write_scene(path, scene)

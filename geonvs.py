@@ -162,6 +162,8 @@ class Config:
                   f"--{option.name} {value} is out of range: use {least} to 2^31 - 1")
         check(set(self.paper.split(",")) <= {"", *PRINTED},
               f"--paper {self.paper} is unknown: use some of {','.join(PRINTED)}")
+        check(Path(self.name).name == self.name,
+              f"--name {self.name} is a path: use a name, as runs are folders below runs/")
         if self.data:
             self.data = os.path.realpath(self.data)  # to be found from any folder
 
@@ -286,7 +288,7 @@ def find_scene(cfg, home=None):
         return data_prep.read_scene(home / path)
     is_there = not cfg.data or Path(cfg.data).is_dir()
     check(is_there or path.exists(),
-          f"{cfg.data} does not exist: give the folder's place by --data; a run that was trained "
+          f"{cfg.data} is no folder: give the folder's place by --data; a run that was trained "
           "with its old place also needs --name")
     return data_prep.open_scene(cfg.source, cfg.downscale)
 
@@ -1558,7 +1560,7 @@ def check_finite(tensors, cfg):
 
 
 def remove_results(run):
-    """Removes what a finished run wrote: it is of a shorter training than the one that goes on."""
+    """Removes what a finished run wrote."""
     for name in RESULTS:
         (run / name).unlink(missing_ok=True)
     shutil.rmtree(run / "held_out", ignore_errors=True)
@@ -1588,8 +1590,10 @@ def train(cfg, scene, run, saved=None, processes=ALONE):
     torch.set_flush_denormal(True)  # vanishing weights would otherwise slow a CPU down
     model, optimizer, gen, state = start(cfg, scene, saved, processes)
     done = state.share_done(cfg)
+    if done >= 1:
+        print("  nothing is left to train: give more --steps or --minutes; it is scored again")
+        model.cfg = Config(**saved["config"])  # what was trained, not what was asked for now
     if saved and done < 1 and processes.is_first:
-        remove_results(run)
         atomic_write(run / "log.jsonl", lambda part: part.write_text("".join(state.log)))
     meter = metered_joules(gen.device, state.joules, processes)
     next(meter, None)  # it counts from here
@@ -1620,6 +1624,7 @@ def train(cfg, scene, run, saved=None, processes=ALONE):
                 if processes.is_first:
                     state.joules = next(meter, None)  # None, never 0, once a counter has failed
                     save(run, model, optimizer, gen, state, terms)
+                    remove_results(run)  # of a shorter training
     if caught or is_stopped:
         raise KeyboardInterrupt(
             f"stopped; step {state.step} is saved, and the same command with --resume goes on")
@@ -1727,7 +1732,8 @@ def evaluate(model, scene, lpips=None, pictures=None):
     for photo in progress(scene.test.tolist(), "scoring held-out photos"):
         name = str(scene.raw["name"][photo])
         rgb, truth, _, _ = render_photo(model, scene, photo, codes[photo])
-        masked = photo_rays(scene, photo).is_masked.reshape(truth.shape[:2]).cpu().numpy()
+        start, end = scene.raw["start"][photo:photo + 2]
+        masked = scene.raw.get("masked", np.zeros(end, bool))[start:end].reshape(truth.shape[:2])
         rows.append(score(rgb, truth, masked, lpips) | dict(name=name))
         if pictures is not None:
             pictures[name] = to_uint8(np.hstack([truth, rgb]))
@@ -1743,8 +1749,8 @@ def evaluate(model, scene, lpips=None, pictures=None):
 def toy_truth(model, scene):
     """Errors of surface and mask that only a toy can tell: see data_prep.toy_truth."""
     near, wall = [torch.as_tensor(scene.raw[key]).to(scene.c2w) for key in ("near_wall", "wall")]
-    _, gradient, _ = model.sdf.derivatives(wall, 0.004)
-    sdf = model.signed_distance(near)
+    gradient = in_chunks(lambda x: model.sdf.derivatives(x, 0.004)[1], wall)
+    sdf = in_chunks(model.signed_distance, near)
     M = None
     if model.has_mask:
         logits = [
@@ -1852,6 +1858,7 @@ def film(model, scene, path):
         video.release()
         video = cv2.VideoCapture(str(part))  # read back, as a writer says nothing of a full disk
         count = sum(1 for _ in iter(lambda: video.read()[0], False))
+        video.release()
         check(count == FRAMES, f"{count} of {FRAMES} frames were written: make room in {folder}, "
               "or pip install --upgrade opencv-contrib-python-headless, which encodes VP9")
         atomic_write(path, lambda new: shutil.copyfile(part, new))
@@ -1896,6 +1903,7 @@ def finish(model, scene, state, run, processes=ALONE):
     memory = peak_memory(is_cuda)  # up to here: not of scoring
     pictures = {}
     scores, codes = evaluate(model, scene, make_lpips(), pictures)
+    fitted = "appearance fitted on the left half, " if codes.numel() else ""
     atomic_write(run / "codes.npy", lambda part: np.save(part, codes.cpu()))
     vertices, faces = extract_mesh(model)
     if len(faces) == 0:
@@ -1917,7 +1925,7 @@ def finish(model, scene, state, run, processes=ALONE):
         model_bytes=sum(tensor.nbytes for tensor in [*model.parameters(), *buffers]),
         octree_cells=model.sdf.octree.cells[:, 0].bincount().tolist(),  # by level
         peak_memory_bytes=memory,
-        protocol="appearance fitted on the left half, scored on the right half",
+        protocol=fitted + "scored on the right half",
         has_mask=model.has_mask,
         torch=torch.__version__,
         commit=code_version(),
@@ -1975,7 +1983,10 @@ def pick_device(name, processes=ALONE):
 def make_config(given):
     """Config's defaults, then GPU_DEFAULTS if photos meet a GPU, then flags."""
     cfg = Config(**given)
-    if cfg.source != "toy" and pick_device(cfg.device).type == "cuda":
+    is_toy = cfg.source == "toy"
+    check(not is_toy or "downscale" not in given,
+          "--downscale is for photos: a toy's size is that of data_prep.py toy --size")
+    if not is_toy and pick_device(cfg.device).type == "cuda":
         cfg = Config(**GPU_DEFAULTS | given)
     return cfg
 
@@ -1988,7 +1999,8 @@ def main(argv=None):
         given.setdefault("minutes", 0.0)  # of two budgets the last one given
     cfg = make_config(given)
     name = f"{data_prep.scene_path(cfg.source).stem}-{GeoNVS.name}-{cfg.seed}"
-    name += "-paper" if cfg.paper else ""
+    if cfg.paper:
+        name += f"-paper-{cfg.paper}".removesuffix("-" + ",".join(PRINTED))
     run = Path("runs", cfg.name or name)
     if render:
         model, scene, _ = load_run(run, **given)

@@ -3813,14 +3813,18 @@ def run_row(run, given, row):
     """Metrics of one training. They are read if the run is there with the same settings; a
     training that diverged is a result, too."""
     cfg = geonvs.make_config(given | row.settings)
-    key = dict(config=asdict(cfg), toy=row.toy, constants=row.constants, method=row.kind.__name__)
+    if row.toy:
+        arrays = make_toy_once(**row.toy)
+    else:
+        arrays = data_prep.open_scene(cfg.source, cfg.downscale)
+    key = dict(
+        config=asdict(cfg),
+        scene=json.loads(str(arrays["info"])),
+        constants=row.constants,
+        method=row.kind.__name__)
     path = run / "row.json"
     saved = json.loads(path.read_text()) if path.exists() else {}
     if saved.get("key") != key:
-        if row.toy:
-            arrays = make_toy_once(**row.toy)
-        else:
-            arrays = data_prep.open_scene(cfg.source, cfg.downscale)
         data_prep.check(arrays["is_test"].any(), "experiments need held-out photos: see README")
         with mock.patch.dict(vars(geonvs), row.constants):
             saved = dict(key=key, metrics=train_row(cfg, arrays, run, row.kind))
