@@ -3185,6 +3185,23 @@ def test_resume_keeps_settings_that_are_not_given(command, monkeypatch):
     assert command("--resume --name=a") == (0, "")  # a finished run is scored again
     assert (RUN / "metrics.json").exists()
     assert (RUN / "film.mp4").exists()
+    assert command("--resume --name=a --steps=7 --paper --lam_gpl=0.5") == (0, "")
+    metrics = json.loads((RUN / "metrics.json").read_text())
+    assert metrics["config"] == saved["config"]  # of what was trained
+    monkeypatch.setattr(geonvs, "training_step", mock.Mock(side_effect=MemoryError()))
+    assert_refused(command("--resume --name=a --steps=9"), "memory")
+    assert (RUN / "metrics.json").exists()  # no longer training has replaced it yet
+
+
+def test_printed_equations_have_a_folder_of_their_own(command, monkeypatch):
+    monkeypatch.setattr(geonvs, "train", lambda cfg, scene, run, *_: [None, run.mkdir()])
+    monkeypatch.setattr(geonvs, "finish", lambda *_: None)
+    flags = FLAGS.replace("--name=b", "--seed=5")
+    for paper in "", "--paper", "--paper=reg", "--paper=alpha,reg":
+        assert command(f"{flags} {paper}") == (0, "")
+    name = "toy-geonvsw-5"
+    assert set(os.listdir("runs")) == {
+        "a", name, f"{name}-paper", f"{name}-paper-reg", f"{name}-paper-alpha,reg"}
 
 
 def test_a_second_run_leaves_the_first_alone(command):
@@ -3233,7 +3250,8 @@ def test_a_run_needs_neither_utf8_nor_resource(command, monkeypatch):
 
 MISTAKES = """
 --stepz=3, --steps=many, --steps=0, --levels=9, --rays=10 --photos=3, --device=cuda,
---scene=brandenbrug, --scene=sacre, --data=nowhere, --resume, --render --data=nowhere
+--scene=brandenbrug, --scene=sacre, --data=nowhere, --resume, --render --data=nowhere,
+--name=../b, --downscale=2
 """
 
 
@@ -4179,6 +4197,10 @@ def test_an_experiment_writes_and_prints_a_table_and_reads_trainings_again(
     monkeypatch.setattr(geonvs, "train", None)  # nothing is trained again
     experiment(argv)
     assert Path(f"{name}.csv").read_text() == table
+    if name != "stress":  # its rows have toys of their own
+        monkeypatch.setattr(data_prep, "open_scene", lambda *_: toy(occluders=0.2))
+        with pytest.raises(TypeError):  # another scene: it would train
+            experiment(argv)
     with pytest.raises(UserError) if name != "chart" else contextlib.nullcontext():
         experiment(["draw"])
 
