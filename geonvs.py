@@ -11,8 +11,8 @@ follow one ray from its pixel to the loss; the training loop comes after them.
     torchrun --nproc_per_node 4 geonvs.py  on 4 GPUs, each with rays of its own
     python geonvs.py --help                every setting with its meaning and default
 
-The paper's equations. `--paper` trains with the forms in the last column and a free zeta; all
-other departures stay.
+The paper's equations. `--paper` trains with the forms in the last column and a zeta without the
+bound of [D8]; all other departures stay.
   Eq. 1  opacity of an interval     neus_alpha                                 paper_alpha
   Eq. 2  compositing weights        composite
   Eq. 3  geometry preservation      gpl_loss
@@ -50,7 +50,7 @@ Departures from the printed paper. The tag stands at the code; .github/RESULTS.m
         M, which L_rgb trains, too     on the place; outliers are        and small at last, where
                                        rejected at first; M is fixed     people have been memorised
                                        at 60 % of training
-  [D4]  CGNet                          a block a stage, GroupNorm, a     photos are small, eight in
+  [D4]  CGNet                          a block a stage, GroupNorm, a     photos are small, a few in
                                        head at each resolution           a batch
   [D5]  a sphere loss in a warm-up     SfM points place the sphere and   else remnants of the ball
                                        seed the octree; s and M are 0    float before facades
@@ -93,7 +93,7 @@ from torch import Tensor, nn
 
 import data_prep
 from data_prep import (
-    UserError, atomic_write, check, is_memory_full, on_signals, progress, run_command_line,
+    UserError, as_user_error, atomic_write, check, on_signals, progress, run_command_line,
     write_ply, write_png)
 
 # distances need float32: TF32 would drown finite differences in rounding errors
@@ -420,9 +420,10 @@ def grid_index(n, device):
 
 
 def pack_index(index, base=2**13):
-    """An index of integers (...,d), each below base, as one integer (...): they are its digits. For
-    a cell or corner (level, i, j, k) it is the key that the octree finds it by; 2^13 is more than
-    the 2,049 corners along an axis of the finest level."""
+    """Reads an index (...,d) as the d digits of one integer (...) in the given base, the first
+    digit being the highest. With the default base this is the key by which the octree finds a cell
+    or corner (level, i, j, k): 2^13 is more than the 2,049 corners along an axis of the finest
+    level. With base n it is the row of a cell (i, j, k) in grid_index(n)."""
     key = index[..., 0]
     for digit in index[..., 1:].unbind(-1):
         key = torch.add(digit, key, alpha=base)  # base key + digit, in one operation
@@ -583,8 +584,9 @@ def seed_octree(octree, points, dense):
 
 def cells_to_split(octree):
     """Cells (N,4) to split: those with the largest summed errors, until they hold SPLIT_SHARE of
-    all errors. A cell is split only if its children are larger than a pixel. Errors are recorded in
-    cells that are not split. [D7]"""
+    the errors of all cells that can be split. A cell can be split if its level is not the last, and
+    its children are larger than the mean pixel that sees it. Errors are recorded in cells without
+    children, since the last refinement, as build sets them to 0. [D7]"""
     level = octree.cells[:, 0]  # (N,)
     error_sum, pixel_sum, count = octree.cell_error.T  # (N,) over rays
     # the mean size of a pixel, pixel_sum / count, is less than a child's side
@@ -876,10 +878,11 @@ class Background(nn.Module):
 
 def surface_depth(t, sdf, w):
     """Distance (R,) to the surface on rays with samples at t (R,S+1), SDF (R,S+1) and weights w
-    (R,S) of the intervals between them: the weighted mean, over intervals, of the place where the
-    line through s at the interval's two ends is zero. Along a ray through a plane s is a line, so
-    all intervals agree. On a curved surface only an interval whose ends have different signs is
-    right, so the others count a hundredth. A ray without weight gets the last sample."""
+    (R,S) of the intervals between them. Each interval extends s as a line to a zero; the result is
+    the weighted mean of these zeros. An interval that leads from outside to inside holds its zero.
+    Any other extrapolates, which is exact for a plane alone, and counts a hundredth: it decides on
+    rays that only graze a surface. Where s rises, w is 0. A ray without weight gets the last
+    sample."""
     start, end = sdf[:, :-1], sdf[:, 1:]
     fraction = start / (start - end).clamp_min(1e-6)  # (R,S) of the interval, up to the zero
     zero = torch.lerp(t[:, :-1], t[:, 1:], fraction)
@@ -926,10 +929,11 @@ def complexity(e_grad, e_curv):
 
 
 def edge_indicator(ray_complexity, opacity):
-    """Phi (R,), Eq. 4: opacity times sigmoid((log K - mean) / deviation), K being the complexity.
-    The paper calibrates its sigmoid, but does not say how. Here mean and deviation are those of the
-    step's rays, weighted by opacity, so that Phi tells edges from flat walls at any scale. A ray
-    through air has no edge, hence the opacity (R,), 0 for rays that do not count. [D2]"""
+    """Phi (R,), Eq. 4: opacity times sigmoid((x - mean) / deviation), x being the logarithm of the
+    complexity. The paper calibrates its sigmoid, but does not say how. Here mean and deviation are
+    those of x over the step's rays, weighted by opacity, so that Phi tells edges from flat walls at
+    any scale. The factor opacity (R,) makes Phi 0 on rays through air, which have no edge. The
+    caller sets it to 0 where a user's mask excludes the pixel, too. [D2]"""
     weight = opacity / opacity.sum().clamp_min(1e-6)  # (R,)
     x = (ray_complexity + 1e-3).log()
     mean = (weight * x).sum()
@@ -952,10 +956,12 @@ def gpl_loss(mask, phi):
 
 def mask_loss(logit, excess):
     """L_reg: binary cross entropy that classifies rays (R,). The label of a ray is 1 if its error
-    exceeds its threshold (excess > 0), else 0; its weight is |excess|. For a ray by itself the best
-    M is the label. The simpler loss (1 - M) error + M threshold has the same minimum, but no
-    gradient where the sigmoid saturates. L_GPL moves the best M of an outlier to
-    min(1, excess / (0.05 Phi)): an edge is masked fully only if excess is at least 0.05. [D3]"""
+    exceeds its threshold (excess > 0), else 0; its weight is |excess|. Without L_GPL the best M of
+    a ray is its label. The simpler loss (1 - M) error + M threshold has the same minimum, but no
+    gradient where the sigmoid saturates. With L_GPL an outlier minimises
+    -excess log M + lam_gpl M Phi (lam_mask is 1). The derivative is 0 at excess / (lam_gpl Phi):
+    that is the best M, or 1 if it is more. So an edge with Phi = 1 is masked fully only if excess
+    is at least lam_gpl. [D3]"""
     is_transient = (excess > 0).float()
     return F.binary_cross_entropy_with_logits(logit, is_transient, excess.abs())
 
@@ -969,10 +975,11 @@ def paper_mask_loss(mask, error):
 
 
 def reject_outliers(mask, is_outlier, done):
-    """M (R,) with 1 for rejected outliers. An outlier is a ray whose error exceeds its threshold.
-    It is rejected if M exceeds a bar. At first the bar is 0, so every outlier is rejected. What the
-    scene has not learnt yet errs in all photos, which raises the threshold of its place, so it is
-    not rejected for long. The bar reaches 1 at REJECTION of training; then M alone decides. [D3]"""
+    """M (R,), set to 1 where a ray is rejected. A ray is rejected if its error exceeds its
+    threshold (is_outlier) and M exceeds a bar. The bar starts at 0, so at first every outlier is
+    rejected. That may be static structure which is not learnt yet, but not for long: structure errs
+    in all photos, and this raises the threshold (UsualErrors, below). The bar reaches 1 at
+    REJECTION of training; from then on M alone decides. [D3]"""
     bar = (done / REJECTION) ** 2  # squared: it rises late
     return torch.where(is_outlier & (mask > bar), 1.0, mask)
 
@@ -1183,11 +1190,12 @@ class GeoNVS(nn.Module):
     @torch.no_grad()
     def sample(self, rays, t0, t1, gen=None):
         """Distances (R,S+1) of the samples between t0 and t1 (R,1), dense where the cache sees a
-        surface. The cache cannot show one that is thinner than half a voxel."""
+        surface. The cache knows where s is 0 to about half a voxel. So, to place samples, a
+        surface is taken to be at least that wide, however large zeta is."""
         even = torch.linspace(0, 1, PROBES + 1, device=t0.device)
         probes = t0.lerp(t1, even)  # (R,PROBES+1)
         sdf = self.cache.sdf(rays.at(probes))  # (R,PROBES+1)
-        alpha = self.alpha(sdf, max_zeta=self.cache.n)  # so 1 / zeta is at least half a voxel
+        alpha = self.alpha(sdf, max_zeta=self.cache.n)  # 1 / n is half a voxel
         return importance_samples(probes, alpha, stratified(rays, self.cfg.samples - 1, gen))
 
     def trace(self, rays, code, gen=None):
@@ -1232,7 +1240,7 @@ class GeoNVS(nn.Module):
         R = len(rays.o)
         code = self.appearance(photos).repeat_interleave(R // len(photos), 0)  # (R,A)
         hits = self.trace(rays, code, gen)
-        n = math.ceil(R / 4)
+        n = math.ceil(R / 4)  # SfM points, and as many in air
         sfm, air = self.known_points(n, gen)  # (n,3), (n,3)
         points = torch.cat([hits.point, sfm, air])  # (R+2n,3), looked up at once [D6]
         s, grad, lap = self.sdf.derivatives(points, self.eps)  # (R+2n,), (R+2n,3), (R+2n,)
@@ -1244,9 +1252,11 @@ class GeoNVS(nn.Module):
         error = residual.detach().amax(1)  # (R,) of the worst channel
         phi = self.phi(rays, hits)  # (R,)
         left_out, reg, gpl = self.transients(rays, photos, hits.place, phi, error, done)
-        pull = self.zeta().detach().clamp_max(MAX_PULL)  # at first s must be free to change [D5]
+        # zeta |s| is s in widths of the surface; at first s must be free to change [D5]
+        pull = self.zeta().detach().clamp_max(MAX_PULL)
         _, s_sfm, s_air = s.split([R, n, n])
-        margin = min(self.sdf.octree.finest, AIR_GAP)  # s can be AIR_GAP at the end of a segment
+        # at a segment's end s is at most AIR_GAP, as the SfM point is that near
+        margin = min(self.sdf.octree.finest, AIR_GAP)
         loss = dict(
             rgb=((1 - left_out) * residual.mean(1)).mean(),  # [D3]
             eik=(eik_weight * eikonal(grad)).mean(),
@@ -1302,8 +1312,9 @@ class GeoNVS(nn.Module):
         return left_out.masked_fill(rays.is_masked, 1), reg, gpl_loss(M, phi)
 
     def update_statistics(self, rays, hits, error):
-        """Follows the errors (R,) of a step's rays: for the mask's threshold those of a place, for
-        refinement those of the octree's cells at surface points, people's among them. [D3] [D7]"""
+        """Records the errors (R,) of a step's rays twice: by place, for the mask's threshold [D3],
+        and by the octree's cell at the surface point, for refinement [D7]. M plays no part, so
+        people's errors are recorded, too; those of pixels that a user's mask excludes are not."""
         self.usual_errors.update(hits.place, error, ~rays.is_masked)
         is_solid = hits.opacity > 0.5  # (R,)
         pixel = hits.depth / self.scene.K[rays.photo, 0]  # (R,) its size at the surface point
@@ -1391,7 +1402,6 @@ def metered_joules(device, joules, processes=ALONE):
 
 # ---- 9 Training ----------------------------------------------------------------------------------
 
-RESULTS = ("metrics.json", "codes.npy", "panel.png", "mesh.ply", "film.mp4")  # and held_out/
 LOG_EVERY = 30  # seconds between lines of the log; a checkpoint is made with each
 
 
@@ -1454,15 +1464,6 @@ def fingerprint(scene):
     return dict(zip([*raw["name"].tolist(), "the sphere"], rows))
 
 
-def changes(before, now):
-    """Names of the rows in which two fingerprints differ by more than the last digits, in which
-    machines differ."""
-    nan = math.nan  # of a missing row: it equals nothing
-    return [
-        name for name in before | now
-        if not np.allclose(before.get(name, nan), now.get(name, nan), rtol=0, atol=5e-5)]
-
-
 def save(run, model, optimizer, gen, state, terms):
     """Adds a line to the log, writes checkpoint.pt (with the log in it) and log.jsonl, and prints.
     terms: the step's losses."""
@@ -1490,37 +1491,32 @@ def save(run, model, optimizer, gen, state, terms):
     print(f"  {done:4.0%}  step {state.step}  psnr {line['psnr']:.2f}", flush=True)
 
 
-@contextlib.contextmanager
-def as_user_error(says, advice):
-    """A UserError for whatever fails with a bad checkpoint: zip, pickle, tensor storage."""
-    try:
-        yield
-    except Exception as error:
-        if isinstance(error, UserError) or is_memory_full(error):
-            raise
-        raise UserError(f"{says} ({error!r:.90}): {advice}, or train under another --name")
-
-
 def read_checkpoint(path, given):
     """A checkpoint's dictionary, of tensors and plain values, never code; and its settings,
     replaced by those given."""
     check(path.exists(), f"{path} does not exist: train first, without --resume or --render, or "
           "name the run by the --scene, --data, --seed, --paper or --name it was made with")
-    with as_user_error(f"{path} is damaged, or of another version of geonvs.py",
-                       "use that version"):
+    what = f"{path} is damaged, too large, or of another version of geonvs.py"
+    with as_user_error(Exception, what, "use that version, or train under another --name"):
         data_prep.refuse_bomb(path)
         saved = dict(torch.load(path, map_location="cpu", weights_only=True))
-        return saved, Config(**saved["config"] | given)
+        saved["scene"] = dict(saved["scene"])
+        cfg = Config(**saved["config"])
+    return saved, replace(cfg, **given)
 
 
 def restore(saved, model, gen=None):
     """Puts a checkpoint's weights into a model. If gen is given, it goes on with the saved random
     numbers; its kind of device must be the same. Returns optimiser and State."""
-    with as_user_error("checkpoint.pt does not fit settings or kind of device",
-                      "use those it was made with"):
-        changed = changes(saved["scene"], fingerprint(model.scene))
-        check(not changed, "checkpoint.pt was trained with other photos, cameras, masks or points: "
-              f"{len(changed)} differ, first {changed[:1]}: use its data, or another --name")
+    old, new = saved["scene"], fingerprint(model.scene)
+    changed = [  # in more than the last digits, in which machines differ; nan equals nothing
+        name for name in old | new if not np.allclose(
+            old.get(name, math.nan), new.get(name, math.nan), rtol=0, atol=5e-5)]
+    check(not changed, "checkpoint.pt was trained with other photos, cameras, masks or points: "
+          f"{len(changed)} differ, first {changed[:1]}: use its data, or another --name")
+    what = "checkpoint.pt does not fit settings or kind of device"
+    advice = "use those it was made with, or train under another --name"
+    with as_user_error(Exception, what, advice):
         for octree, keys in zip(model.octrees, saved["octrees"], strict=True):
             octree.corner_key = octree.corner_key[:0]  # no corner is carried over
             octree.features = nn.Parameter(octree.features[:0])
@@ -1561,7 +1557,7 @@ def check_finite(tensors, cfg):
 
 def remove_results(run):
     """Removes what a finished run wrote."""
-    for name in RESULTS:
+    for name in ("metrics.json", "codes.npy", "panel.png", "mesh.ply", "film.mp4"):
         (run / name).unlink(missing_ok=True)
     shutil.rmtree(run / "held_out", ignore_errors=True)
 
