@@ -45,7 +45,7 @@ Departures from the printed paper. The tag stands at the code; .github/RESULTS.m
   [D2]  E_curv = |lap s|; Phi on       |lap s| h, h being the step of    |lap s| grows as h shrinks;
         every ray                      the difference; L_eik, L_curv,    rays through air have no
                                        Phi are weighted by opacity       edges
-  [D3]  L_reg: penalties of            M is trained to classify rays     printed, crowds lose 0.5 dB;
+  [D3]  L_reg: penalties of            M is trained to classify rays     printed: 0.5 dB in crowds;
         intensity and bimodality of    by error, the threshold depends   errors are large at first,
         M, which L_rgb trains, too     on the place; outliers are        and small at last, where
                                        rejected at first; M is fixed     people have been memorised
