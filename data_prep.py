@@ -19,7 +19,6 @@ Functions raise UserError, one sentence that says what to do."""
 import argparse
 import contextlib
 import gzip
-import hashlib
 import inspect
 import io
 import itertools
@@ -37,7 +36,6 @@ import time
 import unicodedata
 import zipfile
 import zlib
-from collections import defaultdict
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from types import SimpleNamespace
@@ -118,26 +116,20 @@ def as_user_error(errors, what, advice):
 def on_signals(handler):
     """Ctrl-C, SIGTERM and SIGHUP (a closed terminal) call a handler meanwhile, in the main thread.
     A signal that is ignored, as nohup does, stays ignored."""
-    old = {}
-    for name in ("SIGINT", "SIGTERM", "SIGHUP"):
-        number = getattr(signal, name, None)  # Windows has no SIGHUP
-        is_main = threading.current_thread() is threading.main_thread()
-        if number and is_main and signal.getsignal(number) != signal.SIG_IGN:
-            old[number] = signal.signal(number, handler)
-    try:
+    is_main = threading.current_thread() is threading.main_thread()
+    with contextlib.ExitStack() as at_the_end:
+        for name in ("SIGINT", "SIGTERM", "SIGHUP"):
+            number = getattr(signal, name, None)  # Windows has no SIGHUP
+            if number and is_main and signal.getsignal(number) != signal.SIG_IGN:
+                at_the_end.callback(signal.signal, number, signal.signal(number, handler))
         yield
-    finally:
-        for number, former in old.items():
-            signal.signal(number, former)
-
-
-MEMORY_FULL = "allocat|out of memory|ALLOC_FAILED|_NOT_INITIALIZED|nsufficient memory"
 
 
 def is_memory_full(error):
     """Whether an error of Python, OpenCV, a CPU's allocator, CUDA, cuBLAS or cuDNN says so."""
     if isinstance(error, (RuntimeError, cv2.error)):
-        return re.search(MEMORY_FULL, str(error)) is not None
+        says_so = "allocat|out of memory|ALLOC_FAILED|_NOT_INITIALIZED|nsufficient memory"
+        return re.search(says_so, str(error)) is not None
     return isinstance(error, MemoryError)
 
 
@@ -320,9 +312,9 @@ def find_sphere(x, weight, photos, contain):
         counted = counted[counted <= limit]
     # A distance in `counted`: between two of them there may be a gap.
     radius = 1.1 * np.quantile(counted, 0.95, method="inverted_cdf")
-    training = [photo for photo in photos if len(photo.track) and not photo.is_test]
-    check(training, "no training photo observes a usable 3D point: they do not belong together")
-    reach = [np.quantile(distance[photo.track], 0.3) for photo in training]
+    tracks = [photo.track for photo in photos if len(photo.track) and not photo.is_test]
+    check(tracks, "no training photo observes a usable 3D point: they do not belong together")
+    reach = [np.quantile(distance[track], 0.3) for track in tracks]
     corners = 1.02 * lengths(np.reshape(contain, (-1, 3)) - center)  # a margin
     radius = max(radius, np.median(reach), *corners)
     check(radius > EPSILON, "all 3D points coincide: run SfM again")
@@ -443,16 +435,11 @@ def add_statistics(scene):
 
 
 # ---- COLMAP models ---------------------------------------------------------------------
-# COLMAP's camera models: the numbers of their parameters, and what the perspective ones mean.
+# COLMAP's camera models: the numbers of their parameters.
 PARAMETERS = [3, 4, 4, 5, 8, 8, 12, 5, 4, 5, 12, 16, 4, 5, 3, 4, 6, 2]
-PERSPECTIVE = {
-    0: "fx cx cy",
-    1: "fx fy cx cy",
-    2: "fx cx cy k1",
-    3: "fx cx cy k1 k2",
-    4: "fx fy cx cy k1 k2 p1 p2",
-    6: "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6"}
-OPENCV_DISTORTION = "k1 k2 p1 p2 k3 k4 k5 k6".split()
+# The perspective ones begin with f cx cy or fx fy cx cy, then k1 k2 p1 p2 k3 k4 k5 k6 of OpenCV.
+ONE_FOCAL_LENGTH = (0, 2, 3)
+TWO_FOCAL_LENGTHS = (1, 4, 6)
 
 
 def records(path):
@@ -471,19 +458,18 @@ def records(path):
 
 
 def read_cameras(sparse):
-    """{number: ((w, h), K (4,), OPENCV_DISTORTION (8,))} of a model's perspective cameras."""
+    """{number: ((w, h), K (4,), OpenCV's distortion (8,))} of a model's perspective cameras."""
     cameras = {}
     for read in records(sparse / "cameras.bin"):
         number, kind, w, h = read("IiQQ")
         check(0 <= kind < len(PARAMETERS),
               f"{sparse} has an unknown camera model, {kind}: run colmap image_undistorter")
         numbers = read(f"{PARAMETERS[kind]}d")
-        if kind in PERSPECTIVE:
-            value = dict(zip(PERSPECTIVE[kind].split(), numbers))
-            fy = value.get("fy", value["fx"])
-            K = [value["fx"], fy, value["cx"], value["cy"]]
-            distortion = [value.get(name, 0.0) for name in OPENCV_DISTORTION]
-            cameras[number] = (w, h), np.array(K), np.array(distortion)
+        if kind in ONE_FOCAL_LENGTH:
+            numbers = numbers[:1] + numbers
+        if kind in ONE_FOCAL_LENGTH + TWO_FOCAL_LENGTHS:
+            numbers = np.pad(numbers, (0, 12 - len(numbers)))  # what a model lacks is 0
+            cameras[number] = (w, h), numbers[:4], numbers[4:]
     return cameras
 
 
@@ -546,10 +532,9 @@ def read_points(sparse):
 MODEL_FILES = ("cameras.bin", "images.bin", "points3D.bin")
 JPEG = rb"\xff\xd8\xff"  # how a file starts
 HEIC = rb"....ftyp(heic|heix|mif1|msf1)"  # phones often name it .jpg
-# A photo has one of these endings or starts. Some programs leave copies beside it.
+# A photo has one of these types or starts. Some programs leave copies beside it.
 PHOTO_STARTS = rb"\x89PNG|RIFF....WEBP|" + JPEG + b"|" + HEIC
-PHOTO_ENDINGS = tuple(
-    ".jpg .jpeg .png .tif .tiff .bmp .webp .ppm .pgm .jp2 .avif .heic .heif".split())
+PHOTO_TYPES = ".jpg .jpeg .png .tif .tiff .bmp .webp .ppm .pgm .jp2 .avif .heic .heif".split()
 COPY_ENDINGS = ("~", "_original", ".bak", ".thm")
 
 
@@ -585,7 +570,7 @@ def photo_files(folder, posed=()):
         name = path.relative_to(folder).as_posix()
         lower = name.lower()
         is_copy = lower.startswith(("dense/", "masks/")) or lower.endswith(COPY_ENDINGS)
-        is_photo = lower.endswith(PHOTO_ENDINGS) or starts_with(path, PHOTO_STARTS)
+        is_photo = path.suffix.lower() in PHOTO_TYPES or starts_with(path, PHOTO_STARTS)
         if name in posed or (is_photo and not is_copy):
             files[name] = path
     return files
@@ -594,10 +579,11 @@ def photo_files(folder, posed=()):
 def match_names(wanted, there):
     """{wanted name: its name there}: equal, or alike if only one has it on each side. Names that
     differ in case or Unicode form only are alike."""
-    alike = defaultdict(lambda: ([], []))  # by form: names that are wanted, names that are there
+    alike = {}  # by form: names that are wanted, names that are there
     for side, names in enumerate((wanted, there)):
         for name in set(names):
-            alike[unicodedata.normalize("NFC", name).casefold()][side].append(name)
+            form = unicodedata.normalize("NFC", name).casefold()
+            alike.setdefault(form, ([], []))[side].append(name)
     found = {ours[0]: theirs[0] for ours, theirs in alike.values() if len(ours) == len(theirs) == 1}
     return found | {name: name for name in wanted if name in there}
 
@@ -822,9 +808,8 @@ def shrink(image, camera, downscale):
 
 def read_opaque(path, is_mask):
     """Which pixels (h,w) of a file are opaque, and bright in a mask; None for all of them."""
-    layers = []
-    if is_mask:
-        layers.append(read_image(path, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION))
+    grey = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
+    layers = [read_image(path, grey)] if is_mask else []
     if not starts_with(path, JPEG):  # which has no alpha channel
         image = read_image(path, cv2.IMREAD_UNCHANGED)
         check(not GREY_WITH_ALPHA.search(path.read_bytes()),
@@ -847,8 +832,7 @@ def read_mask(photo, path, size):
                 height, width = layer.shape
                 check(abs(width * h / (height * w) - 1) < 0.02,
                       f"has {width} x {height} pixels, its photo {w} x {h}")
-                layer = cv2.resize(layer.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
-                mask *= layer
+                mask *= cv2.resize(layer.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
         except UserError as e:
             warn(f"mask not used: {file} {e}")
     return mask
@@ -872,7 +856,7 @@ def read_usable(model, points, rows, is_held_out, downscale):
             camera, pose, ids = model.photos[name]
             check_photo(camera, pose, is_test)
             image = read_photo(model.files[name], camera[0])
-            pixels = hashlib.sha256(image).digest()
+            pixels = hash(image.tobytes())
             twin = first.get(pixels)
             check(is_test or not twin, f"is the same photo as {twin}")
             image, K = shrink(image, camera, downscale)
@@ -1050,12 +1034,11 @@ for x, y, wide, tall in [  # a house: half width, half height; a tree stands bef
     (-7.5, 2, .6, .75), (-6.2, 4.4, .5, .55), (-4, 6.4, .8, .9), (-1.2, 7.6, .5, 1.15),
     (2, 6.8, .7, .7), (4.6, 5.6, .5, .95), (6.8, 3, .6, .65), (7.4, 0, .5, .85),
 ]:
-    roof = (x, y, 2 * tall + .25)
     crown = 0.8 * wide
     tree = (.8 * x + 1, .7 * y, crown + .2)
     TOWN += [
         Part("box", "town", "plaster", center=(x, y, tall), half=(wide, wide, tall), top=wide),
-        Part("box", "town", "slate", center=roof, half=(wide, wide, .25), top=0),
+        Part("box", "town", "slate", center=(x, y, 2 * tall + .25), half=(wide, wide, .25), top=0),
         Part("ball", "town", "leaf", center=tree, half=(crown, crown, crown), top=crown)]
 
 
@@ -1070,12 +1053,11 @@ def toy_parts(landmark, background=True):
     for groups in [("hall", "dome"), ("dome",), ("tower",), ("annex",), ("statue",)]:
         size = rng.uniform(0.7, 1.2, 3)
         shift = np.append(rng.uniform(-0.06, 0.06, 2), 0)
-        chosen = [i for i, part in enumerate(parts) if part.group in groups]
-        lowest = parts[chosen[0]]
-        foot = np.mean([parts[i].center for i in chosen], axis=0)
+        chosen = {i: part for i, part in enumerate(parts) if part.group in groups}
+        lowest = parts[min(chosen)]
+        foot = np.mean([part.center for part in chosen.values()], axis=0)
         foot[2] = lowest.center[2] - lowest.half[2]
-        for i in chosen:
-            part = parts[i]
+        for i, part in chosen.items():
             grow = size if part.shape == "box" else size[[2, 2, 2]]  # others stay round
             center = foot + (part.center - foot) * size + shift
             parts[i] = part._replace(center=center, half=part.half * grow, top=part.top * grow[0])
@@ -1180,11 +1162,9 @@ def sky_color(d, weather):
 def surface_color(part, x):
     """Linear colours at points on a part: stones, or walls with windows. (P,3) -> (P,3)"""
     x, y, z = x.T
-    across, up = x + y, z
-    if part.shape == "ground":
-        across, up = x, y
-    elif part.shape != "box":
-        across = np.arctan2(y - part.center[1], x - part.center[0])  # the angle
+    angle = np.arctan2(y - part.center[1], x - part.center[0])
+    across = {"ground": x, "box": x + y, "column": angle, "ball": angle}[part.shape]
+    up = y if part.shape == "ground" else z
     color, (width, height), contrast = MATERIALS[part.material]
     row = up / height
     column = across / width
@@ -1386,7 +1366,6 @@ def surface_truth(scene, surface, background, landmark):
 
     def sdf(x):  # (P,3) -> (P,), scene units
         return toy_sdf(x * scale + center, background, landmark) / scale
-
     wall = (surface * TOY_SCALE + TOY_ORIGIN - center) / scale
     wall = wall[lengths(wall) < 0.95]
     normal = gradient(sdf, wall, 0.004)
@@ -1486,9 +1465,9 @@ def download(name):
     with (as_user_error(Exception, f"cannot unpack {archive}", advice),
           tempfile.TemporaryDirectory(dir=DATA) as temporary):
         with gzip.open(archive) as raw, tarfile.open(fileobj=raw, mode="r|") as tar:
-            for member in tar:  # files only: a link could lead outside
-                if member.isfile() and member.name.startswith(wanted):
-                    tar.extract(member, temporary, filter="data")
+            # Files only: a link could lead outside.
+            files = (item for item in tar if item.isfile() and item.name.startswith(wanted))
+            tar.extractall(temporary, files, filter="data")
             while raw.read(1 << 20):  # to the checksum at the very end
                 pass
         shutil.copy(DATA / split, Path(temporary, inner, split))
