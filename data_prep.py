@@ -134,8 +134,7 @@ def is_memory_full(error):
 
 
 def run_command_line(entry, go_on="start again"):
-    """Exit code 0, or 2 with one sentence on stderr; a bug keeps its traceback. go_on: what to do
-    after a stop."""
+    """Exit code 0, or 2 and one sentence on stderr; bugs raise. go_on: what to do after a stop"""
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):  # a notebook's streams print any character
             stream.reconfigure(errors="backslashreplace")  # a terminal may lack it
@@ -498,8 +497,7 @@ def check_photo(camera, pose, is_test):
     numbers = np.concatenate([K, distortion, pose])
     is_sound = (abs(numbers) < MAX_NUMBER).all() and min(K[:2]) > EPSILON and pose[:4].any()
     check(is_sound, "has no sound camera or pose: run SfM again")
-    w, h = wh
-    check(max(wh) < 32767, f"is {w} x {h} pixels, too large: shrink it, then run SfM again")
+    check(max(wh) < 32767, f"is {wh[0]} x {wh[1]} pixels, too large: shrink it, then run SfM again")
     angle = 2 * np.degrees(np.arctan(max(wh / K[:2]) / 2))
     check(is_test or 10 <= angle <= 120, f"is {angle:.1f} degrees wide, which is not in 10..120")
 
@@ -539,9 +537,8 @@ COPY_ENDINGS = ("~", "_original", ".bak", ".thm")
 
 
 def files_below(folder, levels=7):
-    """Files at most so many levels down, without hidden folders and thumbnails. Links are
-    followed, unlike by rglob. A broken link counts as a file, and so does a folder that may not be
-    read."""
+    """Files at most so many levels down, also by links; none in hidden folders and thumbnails. A
+    broken link counts as a file, and so does a folder that may not be read."""
     try:
         paths = sorted(folder.iterdir()) if levels and folder.is_dir() else []
     except PermissionError:
@@ -577,8 +574,7 @@ def photo_files(folder, posed=()):
 
 
 def match_names(wanted, there):
-    """{wanted name: its name there}: equal, or alike if only one has it on each side. Names that
-    differ in case or Unicode form only are alike."""
+    """{wanted: name there}: equal, or the only two that are alike but for case and Unicode form."""
     alike = {}  # by form: names that are wanted, names that are there
     for side, names in enumerate((wanted, there)):
         for name in set(names):
@@ -635,8 +631,7 @@ def open_model(folder, sparse):
         files = {name: on_disk[other] for name, other in match_names(photos, on_disk).items()}
         count = sum(photos[name][0] is not None for name in files)  # those with a camera
         models.append(SimpleNamespace(
-            sparse=sparse, photos=photos, images=images, on_disk=list(on_disk), files=files,
-            count=count))
+            sparse=sparse, photos=photos, images=images, on_disk=on_disk, files=files, count=count))
     return max(models, key=lambda model: len(model.files))
 
 
@@ -845,7 +840,6 @@ def read_usable(model, points, rows, is_held_out, downscale):
     masks = mask_files(model.images, model.files)
     photos = []
     first = {}  # by hash of pixels: name of the first photo that has them
-    lost = []  # held-out photos that cannot be used
     misfits = 0  # photos that miss most of the points that they should see
     names = sorted(is_held_out, key=lambda name: (not is_held_out[name], name))
     for name in progress(names, "preparing photos"):
@@ -867,18 +861,17 @@ def read_usable(model, points, rows, is_held_out, downscale):
             share = is_inside.mean() if len(track) else 1
             misfits += share < 0.5
             check(share >= 0.5, f"shows {share:.0%} of its points: wrong pose or distortion")
+            first.setdefault(pixels, name)
+            mask = read_mask(model.files[name], masks.get(name), camera[0])
+            mask, _ = shrink(mask, camera, downscale)
+            photos.append(Photo(name, image[..., ::-1], mask < 128, K, c2w, track, is_test))
         except UserError as e:
             warn(f"left out: {name} {e}")
-            if is_test:
-                lost.append(name)
-            continue
-        first.setdefault(pixels, name)
-        mask = read_mask(model.files[name], masks.get(name), camera[0])
-        mask, _ = shrink(mask, camera, downscale)
-        photos.append(Photo(name, image[..., ::-1], mask < 128, K, c2w, track, is_test))
     check(misfits <= len(photos),
           f"{misfits} of {misfits + len(photos)} photos miss most of their points: give poses as "
           "COLMAP does, world to camera, x right, y down, z forward, in the units of the points")
+    used = {photo.name for photo in photos}
+    lost = [name for name in names if is_held_out[name] and name not in used]
     check(not lost, f"held-out photos cannot be used, repair them or hold out others: {lost}")
     count = sum(not photo.is_test for photo in photos)
     check(count >= 2, f"{count} usable training photos are too few: repair them or the split file")
@@ -935,8 +928,7 @@ def prepare(name, downscale=2, split=None):
 def scene_path(name_or_folder):
     """data/<scene>.npz; folders get a suffix, so that two of one name do not share a file."""
     folder = Path(name_or_folder).resolve()
-    is_known = name_or_folder in ("toy", *SCENES)
-    mark = "" if is_known else f"-{zlib.crc32(os.fsencode(folder)):08x}"
+    mark = "" if name_or_folder in ("toy", *SCENES) else f"-{zlib.crc32(os.fsencode(folder)):08x}"
     return DATA / f"{folder.name[:50]}{mark}.npz"  # a file's name has 255 bytes at most
 
 
@@ -1205,8 +1197,7 @@ def shade(o, d, parts, background, sun, weather):
 
 
 def toy_camera(rng, azimuth, size):
-    """K (4,), c2w (3,4), width and height of a tourist's camera, in the toy's units. azimuth is
-    its angle [rad] from the front."""
+    """K (4,), c2w (3,4), width and height of a tourist's camera. azimuth: from the front [rad]"""
     aspect = rng.choice([4 / 3, 3 / 2, 1.1, 3 / 4, 2 / 3])
     w = round(size * min(1, aspect))
     h = round(size * min(1, 1 / aspect))
@@ -1251,14 +1242,12 @@ def draw_people(rng, w, h, share):
             ends = feet + np.array([begin, end]) * (height, -height)
             cv2.line(canvas, *ends.astype(int), (*color, 1), int(width * height) + 1)
         left = share - canvas[..., 3].mean()
-    small = cv2.resize(canvas, (w, h), interpolation=cv2.INTER_AREA)
-    return small.reshape(-1, 4).astype(float)
+    return cv2.resize(canvas, (w, h), interpolation=cv2.INTER_AREA).reshape(-1, 4).astype(float)
 
 
 def toy_points(rng, photos, surface, seen):
-    """Points (P,5) as by SfM, noisy and 1.5 % of them wrong, as in build_scene; sets tracks. For
-    each photo, surface: points (h*w,3) that the pixels see; seen: their distances (h*w,), inf
-    where a person is in front"""
+    """Points (P,5) of build_scene, noisy and 1.5 % of them wrong, as by SfM; sets tracks. For each
+    photo, surface: points (h*w,3) of its pixels; seen: their distances (h*w,), inf at a person"""
     samples = []
     count = 3000 // len(photos)
     for x, t in zip(surface, seen):
@@ -1446,8 +1435,7 @@ def fetch(folder_url, path):
     except Exception as e:  # of the disk, the network or its protocol
         if getattr(e, "code", 0) == 416:  # longer than the file itself
             partial.unlink()
-        message = f"the download of {url} broke ({e}); the same command continues it"
-        raise UserError(message) from e
+        raise UserError(f"the download of {url} broke ({e}); the same command continues it") from e
 
 
 def download(name):
@@ -1563,8 +1551,7 @@ def main(argv=None):
     given = vars(parser.parse_args(argv))
     name, is_download, is_sfm = [given.pop(key, None) for key in ("scene", "download", "sfm")]
     path = scene_path(name)
-    allowed = knobs if name == "toy" else ("downscale", "split")
-    wrong = given.keys() - allowed
+    wrong = given.keys() - (knobs if name == "toy" else ("downscale", "split"))
     check(not wrong, f"--{' --'.join(wrong)}: not for {name}")
     if is_download:
         download(name)
