@@ -376,16 +376,6 @@ def build_scene(photos, points, info, contain=()):
     return add_statistics(scene)
 
 
-def brightness_spread(points, brightness):
-    """How much brightness differs between photos: the standard deviation of each photo's median
-    offset from its points' mean brightness. points, brightness: a (M,) per photo."""
-    all_points = np.concatenate(points)
-    mean = np.bincount(all_points, np.concatenate(brightness))
-    mean /= np.maximum(np.bincount(all_points), 1)  # (P,)
-    offsets = [np.median(b - mean[track]) for track, b in zip(points, brightness) if len(track)]
-    return np.std(offsets) if offsets else np.float64(0)
-
-
 def common_color(colors):
     """Median of uint8 colours (P,3), scaled to 0..1; NaN unless 60 % lie within 2 % of it."""
     if len(colors) > 100:  # fewer may all be people
@@ -401,7 +391,7 @@ def add_statistics(scene):
     near: 0.8 x the 2 % quantile of the distances of a photo's points, >= 0.02;
     0.05 without points. The others are about pixels of training photos without a mask.
     footprint: lower quartile of a pixel's size at points in the sphere.
-    exposure_spread: standard deviation of the photos' brightness at the same points.
+    exposure_spread: of photos' median offsets from the mean brightness of the points they see.
     bg_color: seen by rays that miss the sphere, NaN unless 60 % agree."""
     rgb = scene["rgb"]
     masked = scene.get("masked", np.zeros(len(rgb), bool))
@@ -426,10 +416,13 @@ def add_statistics(scene):
         pixel = scene["start"][i] + np.arange(len(d))
         is_background = (lengths(closest) > 1) & ~masked[pixel]
         background.append(rgb[pixel[is_background][::step]])
+    point = np.concatenate(observed)
+    mean = np.bincount(point, np.concatenate(brightness)) / np.maximum(np.bincount(point), 1)
+    offsets = [np.median(b - mean[track]) for track, b in zip(observed, brightness) if len(track)]
     return scene | dict(
         near=np.float32(near), track_uv=np.concatenate(track_uv, dtype=np.float32),
         footprint=np.quantile(np.concatenate(sizes), 0.25),
-        exposure_spread=brightness_spread(observed, brightness),
+        exposure_spread=np.std(offsets or [0]),
         bg_color=common_color(np.concatenate(background)))
 
 
@@ -1160,10 +1153,9 @@ def surface_color(part, x):
     color, (width, height), contrast = MATERIALS[part.material]
     row = up / height
     column = across / width
-    if part.material in ("sand", "brick", "plaster"):
-        is_window = (abs(column % 1 - 0.5) < 0.2) & (abs(row % 1 - 0.45) < 0.28)
-    else:
-        is_window = False
+    has_windows = part.material in ("sand", "brick", "plaster")
+    is_window = has_windows & (abs(column % 1 - 0.5) < 0.2) & (abs(row % 1 - 0.45) < 0.28)
+    if not has_windows:
         column += np.floor(row) % 2 / 2  # every other row of stones is shifted
     # A random number per cell: the hash by a sine that shaders use.
     chance = np.sin(12.9898 * np.floor(column) + 78.233 * np.floor(row))
@@ -1495,9 +1487,7 @@ def write_sfm_masks(files, masks, folder):
 def run_sfm(folder):
     """Finds the poses of the raw photos in a folder by pycolmap and writes folder/sparse/{0,1,...}.
     The database waits in data/ for a second try and goes after a success."""
-    images = folder / "images"
-    if not images.is_dir():
-        images = folder
+    images = folder / "images" if (folder / "images").is_dir() else folder
     sparse = folder / "sparse"
     check(not sparse.exists() and not (folder / "dense").exists(),
           f"{folder} has sparse/ or dense/, a model: leave --sfm out, or delete that")
