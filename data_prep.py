@@ -616,8 +616,7 @@ def mask_files(images, names):
 def open_model(folder, sparse):
     """Reads a COLMAP model and finds the folder that holds most of its photos."""
     photos = read_photos(sparse)
-    around = [sparse, *sparse.parents]
-    around = around[:around.index(folder) + 1]
+    around = [place for place in (sparse, *sparse.parents) if place.is_relative_to(folder)]
     models = []
     for images in [place / name for place in around for name in ("images", "input", "")]:
         on_disk = photo_files(images, photos)
