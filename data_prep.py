@@ -391,7 +391,7 @@ def add_statistics(scene):
     near: 0.8 x the 2 % quantile of the distances of a photo's points, >= 0.02;
     0.05 without points. The others are about pixels of training photos without a mask.
     footprint: lower quartile of a pixel's size at points in the sphere.
-    exposure_spread: of photos' median offsets from the mean brightness of the points they see.
+    exposure_spread: standard deviation of photos' median offsets from points' mean brightness.
     bg_color: seen by rays that miss the sphere, NaN unless 60 % agree."""
     rgb = scene["rgb"]
     masked = scene.get("masked", np.zeros(len(rgb), bool))
@@ -567,7 +567,7 @@ def photo_files(folder, posed=()):
 
 
 def match_names(wanted, there):
-    """{wanted: name there}: equal, or the only two that are alike but for case and Unicode form."""
+    """{wanted: name there}: equal, or the only two that differ just in case or Unicode form."""
     alike = {}  # by form: names that are wanted, names that are there
     for side, names in enumerate((wanted, there)):
         for name in set(names):
@@ -1188,7 +1188,7 @@ def shade(o, d, parts, background, sun, weather):
 
 
 def toy_camera(rng, azimuth, size):
-    """K (4,), c2w (3,4), width and height of a tourist's camera. azimuth: from the front [rad]"""
+    """K (4,), c2w (3,4) in the toy's units, width, height; azimuth: angle from the front [rad]"""
     aspect = rng.choice([4 / 3, 3 / 2, 1.1, 3 / 4, 2 / 3])
     w = round(size * min(1, aspect))
     h = round(size * min(1, 1 / aspect))
