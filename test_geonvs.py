@@ -238,13 +238,11 @@ class Evil(str):
     negative=("track_photo track_point", -1),
     mirrored=("wh", lambda wh: -wh),
     no_such_photo=("track_photo", 8),  # photos are 0..7
-    no_such_point=("track_point", 10 ** 6),
     nothing_to_train=("is_test", True),
-    no_json=("info", "x"),
-    json_of_a_list=("info", "[1]"),
     no_split=("info", '{"kind": 1, "scene": 1, "downscale": 1, "folder": 1}'),
     late_start=("start", lambda start: np.maximum(start, 1)),
     missing_pixel=("rgb", lambda rgb: rgb[1:]),
+    missing_photo=("K c2w is_test name near", lambda array: array[1:]),
     code=("name", lambda name: np.array([Evil("harm")], object)))
 def test_impossible_arrays_are_refused(in_tmp_dir, keys, change):
     good = toy() | dict(masked=np.zeros(len(toy()["rgb"]), bool))
@@ -432,23 +430,6 @@ PHOTO = IMAGES / "toy_000.png"  # for training, 24 x 32 pixels; toy_002 and toy_
 BLACK = np.zeros((32, 24))
 
 
-def colmap_model(scene):
-    """Columns of a COLMAP model, to be changed and written: a row a photo, or a row a point."""
-    turn = Rotation.from_matrix(scene["c2w"][:, :, :3]).inv()
-    x, y, z, w = 2 * turn.as_quat().T  # of any length
-    t = -turn.apply(world(scene, scene["c2w"][:, :, 3]))
-    photos = range(len(t))
-    return SimpleNamespace(
-        names=scene["name"].tolist(),
-        camera_ids=np.add(photos, 7),
-        cameras=[[1, *wh, *K] for wh, K in zip(scene["wh"], scene["K"])],  # 1 is PINHOLE
-        poses=np.column_stack([w, x, y, z, t]),
-        sightings=[5 * scene["track_point"][scene["track_photo"] == i] for i in photos],
-        x=world(scene, scene["points"].astype(float)),
-        errors=np.full(len(scene["points"]), .5),
-        views=np.bincount(scene["track_point"]))
-
-
 def put(path, content):
     """Writes a file, bytes or text, in a folder that may be new."""
     path = Path(path)
@@ -479,14 +460,27 @@ def encoded(image, kind=".png"):
 
 
 def write_folder(scene, images="images", sparse="sparse", folder="place"):
-    """Photos, model and split table; the model's columns."""
-    model = colmap_model(scene)
-    write_model(model, Path(folder, sparse))
+    """Photos, split table and COLMAP model. Returns the model's columns, to be changed and written
+    again: a row a photo, or a row a point."""
+    turn = Rotation.from_matrix(scene["c2w"][:, :, :3]).inv()
+    x, y, z, w = 2 * turn.as_quat().T  # of any length
+    t = -turn.apply(world(scene, scene["c2w"][:, :, 3]))
+    model = SimpleNamespace(
+        names=scene["name"].tolist(),
+        camera_ids=np.arange(len(t)) + 7,
+        cameras=[[1, *wh, *K] for wh, K in zip(scene["wh"], scene["K"])],  # 1 is PINHOLE
+        poses=np.column_stack([w, x, y, z, t]),
+        sightings=[],
+        x=world(scene, scene["points"].astype(float)),
+        errors=np.full(len(scene["points"]), .5),
+        views=np.bincount(scene["track_point"]))
     table = "split\tfilename\n"
     for i, name in enumerate(model.names):
+        model.sightings.append(5 * scene["track_point"][scene["track_photo"] == i])
         put(Path(folder, images, name), encoded(photo(scene, i)[..., ::-1]))
         table += f"{'test' if scene['is_test'][i] else 'train'}\t{name}\n"
     put(Path(folder, "toy.tsv"), table)
+    write_model(model, Path(folder, sparse))
     return model
 
 
@@ -505,15 +499,10 @@ def made(flags=""):
 @cases(
     "images, sparse, names, on_disk",
     undistorted=("dense/images", "dense/sparse", "{}.png", "{}.png"),
-    numbered=("images", "sparse/0", "{}.png", "{}.png"),
-    deep=("images", "colmap/sparse/0", "{}.png", "{}.png"),
-    beside_images=("images", ".", "{}.png", "{}.png"),
-    linked=("input", "distorted/sparse/0", "{}.png", "{}.png"),
     amid_photos=(".", "sparse", "{}.png", "{}.png"),
-    spaces=("images", "sparse", "a b/ü {}.png", "a b/ü {}.png"),
-    of_windows=("images", "sparse", "a b\\{}.png", "a b/{}.png"),
-    of_a_mac=("images", "sparse", "é{}.png", "e\u0301{}.PNG"),  # composed and decomposed
-    no_utf8=("images", "sparse", "\udcff{}.png", "\udcff{}.png"))
+    deep_and_of_windows=("images", "colmap/sparse/0", "a b\\ü {}.png", "a b/ü {}.png"),
+    linked_and_not_utf8=("input", "distorted/sparse/0", "\udcff{}.png", "\udcff{}.png"),
+    beside_images_of_a_mac=("images", ".", "é{}.png", "e\u0301{}.PNG"))  # decomposed
 def test_a_scene_survives_colmap_files(in_tmp_dir, images, sparse, names, on_disk):
     source = toy() | dict(name=np.array([on_disk.format(i) for i in range(8)]))
     put("place/elsewhere/notes.txt", "no photo")
@@ -864,6 +853,7 @@ toy_004.png\t\ttrain
 my/toy_007.png\t4\ttrain
 a ghost\t5\ttrain
 """
+OF_WINDOWS = "\ufeff" + ROWS.replace("\n", "\r\n\r\n").replace("\t", ";")
 LISTS = {
     "train_list.txt": "\ufeffTOY_000.png\r\ntoy_003.png\r\n\r\nmy/toy_007.png\r\na ghost",
     "test_list.txt": "toy_005.png"}
@@ -872,14 +862,11 @@ LISTS = {
 @cases(
     "files, flags, first",
     tabs=({"s.tsv": ROWS}, "", "s.tsv"),
-    mark=({"s.tsv": "\ufeff" + ROWS}, "", "s.tsv"),
-    of_windows=({"s.tsv": ROWS.replace("\n", "\r\n\r\n")}, "", "s.tsv"),
     nameless_column=({"s.tsv": "\t" + ROWS.replace("\n", "\n\t")}, "", "s.tsv"),
     commas=({"nerfw_split.csv": ROWS.replace("\t", ",")}, "", "nerfw_split.csv"),
-    semicolons=({"s.csv": ROWS.replace("\t", ";")}, "", "s.csv"),
+    of_windows=({"s.csv": OF_WINDOWS}, "", "s.csv"),
     quoted=({"s.csv": re.sub(r"([^\t\n]+)", r'"\1"', ROWS).replace("\t", ",")}, "", "s.csv"),
-    one_of_two=({"s.tsv": ROWS, "t.tsv": ROWS}, "--split place/t.tsv", "t.tsv"),
-    named_elsewhere=({"../mine.tsv": ROWS}, "--split mine.tsv", "mine.tsv"),
+    named_elsewhere=({"s.tsv": ROWS, "../mine.tsv": ROWS}, "--split mine.tsv", "mine.tsv"),
     lists=(LISTS, "", "train_list.txt"),
     named_list=(LISTS, "--split place/test_list.txt", "train_list.txt"))
 def test_a_split_is_found_read_and_remembered(model, files, flags, first):
@@ -976,17 +963,17 @@ BLACK_LEFT = np.repeat([[0, 255]], 24, 1)[[0] * 64]  # twice as large as the pho
 
 @cases(
     "name, mask",
-    beside=("toy_000.png", "place/masks/toy_000.png"),
-    within=("toy_000.png", "place/images/masks/toy_000.png"),
-    in_capitals=("toy_000.JPG", "place/MASKS/TOY_000.PNG"),
-    of_the_stem=("toy_000.jpg", "place/masks/toy_000.png"),
-    of_the_name=("toy_000.jpg", "place/masks/toy_000.jpg.png"),
-    of_the_same_name=("toy_000.jpg", "place/images/masks/toy_000.jpg"))
-def test_black_pixels_of_masks_are_left_out(model, name, mask):
-    change("names", 0, name)(model)
-    PHOTO.rename(IMAGES / name)
+    beside=("toy_000.png", "dense/masks/toy_000.png"),
+    within=("toy_000.png", "dense/images/masks/toy_000.png"),
+    in_capitals=("toy_000.JPG", "MASKS/TOY_000.PNG"),
+    of_the_stem=("toy_000.jpg", "masks/toy_000.png"),
+    of_the_name=("toy_000.jpg", "masks/toy_000.jpg.png"),
+    of_the_same_name=("toy_000.jpg", "dense/images/masks/toy_000.jpg"))
+def test_black_pixels_of_masks_are_left_out(in_tmp_dir, name, mask):
+    source = toy() | dict(name=np.array([name, *toy()["name"][1:]]))
+    write_folder(source, "dense/images", "dense/sparse")
     TABLE.unlink()
-    put(mask, encoded(BLACK_LEFT, Path(mask).suffix))
+    put(Path("place", mask), encoded(BLACK_LEFT, Path(mask).suffix))
     scene, out, err = made()
     share = scene["masked"].mean()
     assert "8 photos on disk" in out
@@ -995,13 +982,6 @@ def test_black_pixels_of_masks_are_left_out(model, name, mask):
     assert scene["masked"].sum() == 16 * 6
     assert "every eighth photo" in out
     assert scene["is_test"].tolist() == [False] * 7 + [True]
-
-
-def test_masks_may_lie_beside_dense(in_tmp_dir):
-    for name in ("dense/images", "masks", "maps"):
-        Path("place", name).mkdir(parents=True)
-    assert data_prep.mask_folders(Path("place/dense/images")) == [Path("place/masks")]
-    assert data_prep.mask_folders(Path("place/dense/images/masks")) == []
 
 
 @cases(
@@ -1017,6 +997,7 @@ def test_an_alpha_channel_is_a_mask(model, file, share):
     scene, out, err = made("--downscale 1")
     assert ("in 1 of 8 photos" in out) == (share > 0)
     assert scene.get("masked", np.zeros(1)).sum() == share * 32 * 24
+    put("masks/toy_000.png", encoded(BLACK))  # too far away
     put(MASKS / "toy_000.png", encoded(BLACK_LEFT))  # both count
     masked = photo(made("--downscale 1")[0], 0, "masked")
     assert np.array_equal(masked, masked[-1] | masked[:, -1:])
@@ -1288,17 +1269,18 @@ def pycolmap(model, monkeypatch):
 def test_sfm_calls_pycolmap_in_order(pycolmap):
     Path(IMAGES, "lost.png").symlink_to("nowhere")
     scene, out, err = made("--sfm")
-    extract, match, map_photos = [call for call in pycolmap.method_calls if call[1]]
-    database, *photos = extract[1]
-    sift = pycolmap.FeatureExtractionOptions().sift
-    assert sift.estimate_affine_shape is sift.domain_size_pooling is True
-    assert pycolmap.FeatureMatchingOptions().guided_matching is True
-    assert extract[0] == "extract_features"
-    assert photos == [IMAGES, toy()["name"].tolist()]
-    assert "mask_path" not in vars(extract[2]["reader_options"])  # no photo has a mask
-    assert match[:2] == ("match_exhaustive", (database,))
-    assert map_photos[0] == "incremental_mapping"
-    assert map_photos[1][:2] == (database, IMAGES)
+    extract, match, map_photos = [call for call in pycolmap.method_calls if call.args]
+    reader = pycolmap.ImageReaderOptions()
+    features = pycolmap.FeatureExtractionOptions()
+    matching = pycolmap.FeatureMatchingOptions()
+    database, _, models = map_photos.args
+    assert extract == mock.call.extract_features(
+        database, IMAGES, list(toy()["name"]), reader_options=reader, extraction_options=features)
+    assert match == mock.call.match_exhaustive(database, matching_options=matching)
+    assert map_photos == mock.call.incremental_mapping(database, IMAGES, models)
+    assert features.sift.estimate_affine_shape is features.sift.domain_size_pooling is True
+    assert matching.guided_matching is True
+    assert "mask_path" not in vars(reader)  # no photo has a mask
     assert database.parts[0] == "data"  # not among photos
     assert "8 posed by place/sparse/1" in out
     assert "left out is another model: 2 posed by place/sparse/0" in out
