@@ -568,17 +568,16 @@ def test_the_largest_model_is_taken_and_leftovers_told(model):
     radial=(3, [70], [.2, .05]),
     opencv=(4, [70, 72], [.1, 0, .01, -.01]),
     full_opencv=(6, [70, 72], [.1, 0, .01, -.01, 0, 0, 0, .5]))
-@pytest.mark.parametrize("downscale", [1, 4])
-def test_photos_agree_with_their_camera(model, kind, focal, distortion, downscale):
-    v, u = np.indices((60, 90)) + .5
+def test_small_straight_photos_agree_with_their_camera(model, kind, focal, distortion):
+    v, u = np.indices((61, 91)) + .5
     put(PHOTO, encoded((u + 2 * v).round()))
     put(MASKS / "toy_000.png", encoded((u > 50) * 255))
-    model.cameras[0] = [kind, 90, 60, *focal, 44, 31, *distortion]
+    put(IMAGES / "toy_007.png", encoded(np.tile([0, 0, 255], (32, 8))))
+    model.cameras[0] = [kind, 91, 61, *focal, 44, 31, *distortion]
     model.sightings[0] = []
     write_model(model)
-    scene = data_prep.prepare("place", downscale)
-    assert scene["wh"][0].tolist() == [90 // downscale, 60 // downscale]
-    d = data_prep.ray_directions(scene["K"][0], np.eye(3), *scene["wh"][0])
+    scene = data_prep.prepare("place", 3)
+    d = data_prep.ray_directions(scene["K"][0], np.eye(3), 30, 20)
     padded = np.append(distortion, np.zeros(8))[:8]
     xy, _ = cv2.projectPoints(d, np.zeros(3), np.zeros(3), np.eye(3), padded)
     uv = xy[:, 0] * focal + (44, 31)
@@ -586,14 +585,9 @@ def test_photos_agree_with_their_camera(model, kind, focal, distortion, downscal
     masked = photo(scene, 0, "masked").ravel()
     assert np.abs(miss).max() < 3
     assert abs(miss.mean()) < .3  # half a pixel would be 1.5
-    assert masked[uv[:, 0] < 50 - downscale].all()
-    assert not masked[uv[:, 0] > 51 + downscale].any()
-
-
-def test_photos_shrink_as_a_mean(model):
-    stripes = np.arange(24) % 2 * 254
-    put(PHOTO, encoded(np.tile(stripes, (32, 1))))
-    assert_arrays_close(photo(data_prep.prepare("place"), 0), 127)
+    assert masked[uv[:, 0] < 48].all()
+    assert not masked[uv[:, 0] > 53].any()
+    assert_arrays_close(photo(scene, 7), 85)  # a mean
 
 
 def saved(picture, kind, **options):
@@ -785,16 +779,6 @@ def test_a_jpeg_ends_with_its_first_end_mark(progressive):
     for rest in (b"", b"\0" * 9, jpeg[:99], b"ftypmp42" + segment(0xda, b"raw")):
         assert not data_prep.is_cut_off(whole + rest)
     assert all(data_prep.is_cut_off(whole[:size]) for size in range(2, len(whole)))
-
-
-@cases(
-    "module, function, error",
-    read=(cv2, "imdecode", cv2.error("(-4:Insufficient memory) Failed to allocate 9 bytes")),
-    shrink=(cv2, "resize", cv2.error("(-4:Insufficient memory) Failed to allocate 9 bytes")),
-    join=(np, "concatenate", MemoryError()))
-def test_a_full_memory_is_no_damaged_photo(model, monkeypatch, module, function, error):
-    monkeypatch.setattr(module, function, mock.Mock(side_effect=error))
-    assert_error("the memory is full", "place")
 
 
 def test_what_may_not_be_read_is_passed_over(model, monkeypatch):
@@ -1144,14 +1128,13 @@ def test_points_lie_on_surfaces_in_plain_view():
 def test_pose_noise_is_in_pixels_rms():
     rng = np.random.default_rng(0)
     K = np.array([50, 50, 16, 16])
-    shift = []
-    for _ in range(500):
+    uv = np.zeros((500, 2))
+    for i in range(500):
         c2w = np.eye(3, 4)
         c2w[2, 3] = -4  # looks at the landmark
         data_prep.add_pose_noise(rng, K, c2w, 2.0)
-        uv, _ = data_prep.project(K, c2w, np.zeros((1, 3)))
-        shift.append(lengths(uv - 16))
-    assert abs(np.mean(np.square(shift)) - 4) < .4
+        uv[i], _ = data_prep.project(K, c2w, np.zeros((1, 3)))
+    assert abs(((uv - 16) ** 2).sum(1).mean() - 4) < .4
 
 
 # ---- downloads -----------------------------------------------------------------------------------
@@ -1163,7 +1146,7 @@ GOOD = {
     DENSE + "sparse/cameras.bin": b"x",
     DENSE + "stereo/big.bin": b"y",
     "brandenburg_gate/other.txt": b"z"}
-EVIL = {DENSE + "images/link/evil.txt": b"x"}  # lies outside, where link is a link
+LINK = {DENSE + "images/link": "../../../..", DENSE + "images/link/evil.txt": b"x"}
 HOME = Path("data/brandenburg")
 
 
@@ -1234,9 +1217,7 @@ def test_a_broken_download_goes_on(server, part, status, limit, starts):
 @cases(
     "data, is_refused",
     dots=(archive(GOOD | {DENSE + "images/../../../../evil.txt": b"x"}), True),
-    link_to_root=(archive(GOOD | {DENSE + "images/link": "/etc"} | EVIL), False),
-    link_with_dots=(archive(GOOD | {DENSE + "images/link": "../../../.."} | EVIL), False),
-    folder_is_link=(archive(GOOD | {DENSE + "images": "/tmp"} | EVIL), False),
+    link=(archive(GOOD | LINK), False),
     cut_off=(archive(GOOD)[:30_000], True),
     wrong_checksum=(archive(GOOD)[:-8] + b"wrong checksum", True),
     of_something_else=(archive({"brandenburg_gate/other.txt": b"z"}), True))
@@ -1309,9 +1290,8 @@ def test_a_second_sfm_takes_up_the_first(pycolmap):
 
 
 def test_renamed_photos_are_matched_anew(model):
-    second, copy = IMAGES / "toy_001.png", Path(shutil.copy(PHOTO, "copy.png"))
-    lists = [PHOTO], [second], [PHOTO, second], [copy]
-    assert len(set(map(data_prep.checksum, lists))) == 4
+    copy = Path(shutil.copy(PHOTO, "copy.png"))
+    assert data_prep.checksum([copy]) != data_prep.checksum([PHOTO])
 
 
 def test_sfm_asks_for_its_place_first(pycolmap, monkeypatch):
@@ -1368,16 +1348,20 @@ def test_misspelt_commands_exit_with_2(model, command):
     assert_error("error: ", command)
 
 
+OPENCV_FULL = cv2.error("(-4:Insufficient memory) Failed to allocate 9 bytes")
+
+
 @cases(
-    "happens, says",
-    ctrl_c=(KeyboardInterrupt, "stopped"),
-    sigterm=(lambda **knobs: signal.raise_signal(signal.SIGTERM), "stopped"),
-    full_memory=(MemoryError(), "the memory is full"),
-    full_disk=(OSError(28, "No space left"), "No space left"))
-def test_a_stop_is_one_sentence(in_tmp_dir, monkeypatch, happens, says):
-    make_toy = mock.create_autospec(data_prep.make_toy, side_effect=happens)
-    monkeypatch.setattr(data_prep, "make_toy", make_toy)
-    assert_error(says, "toy")
+    "module, function, happens, says",
+    ctrl_c=(data_prep, "prepare", KeyboardInterrupt, "stopped"),
+    sigterm=(data_prep, "prepare", lambda _: signal.raise_signal(signal.SIGTERM), "stopped"),
+    full_disk=(data_prep, "prepare", OSError(28, "No space left"), "No space left"),
+    full_memory=(np, "concatenate", MemoryError(), "the memory is full"),
+    full_at_a_photo=(cv2, "imdecode", OPENCV_FULL, "the memory is full"),  # it is not damaged
+    full_at_its_size=(cv2, "resize", OPENCV_FULL, "the memory is full"))
+def test_a_stop_is_one_sentence(model, monkeypatch, module, function, happens, says):
+    monkeypatch.setattr(module, function, mock.Mock(side_effect=happens))
+    assert_error(says, "place")
 
 
 # ---- models and rays for tests -------------------------------------------------------------------
