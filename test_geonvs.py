@@ -526,22 +526,20 @@ def test_a_scene_survives_colmap_files(in_tmp_dir, images, sparse, names, on_dis
     assert_arrays_close(world(scene, scene["points"]), world(source, source["points"]), atol=1e-4)
 
 
-@cases(
-    "wanted, there, found",
-    equal_before_alike=("a.jpg A.jpg", "a.jpg", {"a.jpg": "a.jpg"}),  # two share no file
-    two_for_one=("a.jpg A.jpg", "A.JPG", {}),
-    one_of_two=("a.jpg", "A.jpg a.JPG", {}))
-def test_equal_names_go_before_alike_ones(wanted, there, found):
-    assert data_prep.match_names(wanted.split(), there.split()) == found
+def test_equal_names_go_before_alike_ones():
+    match = data_prep.match_names
+    assert match(["a.jpg", "A.jpg"], ["a.jpg"]) == {"a.jpg": "a.jpg"}  # two share no file
+    assert match(["a.jpg", "A.jpg"], ["A.JPG"]) == {}
+    assert match(["a.jpg"], ["A.jpg", "a.JPG"]) == {}
 
 
 def test_a_photo_is_known_by_its_content(model):
     names = ["a.jfif", "a.mpo", "a", "a.JPG_large", "a.PNG"]
     for name in [*names, "a.jpg_original", "a.jpg~", "a.THM", ".a.jpg"]:  # the last are copies
         put(IMAGES / name, encoded(BLACK, ".jpg"))
-    put(IMAGES / "a.dng", encoded(BLACK, ".tiff"))  # raw
     put(IMAGES / "a.txt", "text")
-    model.names[:5] = names
+    put(IMAGES / "a.dng", encoded(BLACK, ".tiff"))  # raw: a photo if the model names it
+    model.names[:6] = [*names, "a.dng"]
     write_model(model)
     assert data_prep.photo_files(IMAGES).keys() == {*names, *toy()["name"]}
     assert data_prep.find_model(Path("place")).count == 8
@@ -698,17 +696,6 @@ def test_the_folder_around_images_is_named(model, in_tmp_dir):
 HEIC = b"\0\0\0\x18ftypheic" + bytes(99)
 
 
-def dangle(model):
-    PHOTO.unlink()
-    PHOTO.symlink_to("nowhere")
-
-
-def make_raw(model):
-    put(IMAGES / "toy_000.dng", "raw data")
-    put(TABLE, TABLE.read_text().replace("000.png", "000.dng"))
-    change("names", 0, "toy_000.dng")(model)
-
-
 def twins(first, second, has_table=True):
     """Copies a photo onto another, with its camera, pose and points."""
     def apply(model):
@@ -732,11 +719,9 @@ def twins(first, second, has_table=True):
     wrong_pose=(change("poses", (0, 4), 99), "shows 0% of its points"),
     folding=(change("cameras", 0, [2, 24, 32, 26, 12, 16, 300]), "wrong pose or distortion"),
     empty=(new(PHOTO, b""), "is empty, damaged, too large or of an unknown type"),
-    raw=(make_raw, "toy_000.dng is empty, damaged, too large or of an unknown type"),
     heic=(new(PHOTO, HEIC), "is HEIC, which cannot be read"),
     cut_png=(new(PHOTO, encoded(BLACK)[:-20]), "is cut off"),
     turned=(new(PHOTO, jpeg(BLACK.T, 1)), "has 32 x 24 pixels, its camera 24 x 32"),
-    dangling=(dangle, "is a broken link"),
     nearly_black=(new(MASKS / "toy_000.png", encoded(BLACK + 1)), "is black or transparent all"),
     transparent=(new(PHOTO, encoded(np.zeros((32, 24, 4)))), "is black or transparent all over"),
     grey_tiff=(new(PHOTO, grey_with_alpha("TIFF")), "is a grey TIFF with alpha, which cannot be"),
@@ -766,17 +751,14 @@ def test_bad_photos_are_found_in_one_go(model):
     assert err.endswith("repair them or hold out others: ['toy_006.png']\n")
 
 
-def segment(mark, content):
-    return bytes([255, mark]) + struct.pack(">H", len(content) + 2) + content
-
-
 @pytest.mark.parametrize("progressive", [0, 1])
 def test_a_jpeg_ends_with_its_first_end_mark(progressive):
     image = np.random.default_rng(0).integers(0, 255, (40, 50, 3))
     options = [cv2.IMWRITE_JPEG_PROGRESSIVE, progressive, cv2.IMWRITE_JPEG_RST_INTERVAL, 2]
     jpeg = cv2.imencode(".jpg", np.uint8(image), options)[1].tobytes()
-    whole = jpeg[:2] + segment(0xe1, b"Exif" + jpeg) + jpeg[2:]  # with a thumbnail
-    for rest in (b"", b"\0" * 9, jpeg[:99], b"ftypmp42" + segment(0xda, b"raw")):
+    thumbnail = struct.pack(">HH", 0xffe1, len(jpeg) + 2) + jpeg
+    whole = jpeg[:2] + thumbnail + jpeg[2:]
+    for rest in (b"", b"\0" * 9, jpeg[:99], b"ftypmp42\xff\xda\0\5raw"):
         assert not data_prep.is_cut_off(whole + rest)
     assert all(data_prep.is_cut_off(whole[:size]) for size in range(2, len(whole)))
 
@@ -784,6 +766,8 @@ def test_a_jpeg_ends_with_its_first_end_mark(progressive):
 def test_what_may_not_be_read_is_passed_over(model, monkeypatch):
     lost = Path("place/lost+found")
     lost.mkdir()
+    Path(IMAGES, "toy_001.png").unlink()
+    Path(IMAGES, "toy_001.png").symlink_to("nowhere")
     for function in (Path.iterdir, Path.read_bytes):
         def refuse(self, function=function):
             if self in (lost, PHOTO):
@@ -791,10 +775,11 @@ def test_what_may_not_be_read_is_passed_over(model, monkeypatch):
             return function(self)
         monkeypatch.setattr(Path, function.__name__, refuse)
     scene, out, err = made()
-    assert len(scene["name"]) == 7
+    assert len(scene["name"]) == 6
     assert err.splitlines() == [
         "passed over: the folder place/lost+found may not be read",
-        "left out: toy_000.png cannot be read: Permission denied"]
+        "left out: toy_000.png cannot be read: Permission denied",
+        "left out: toy_001.png is a broken link: copy the photo itself"]
 
 
 @pytest.mark.parametrize("ahead, is_room", [(.5, True), (-.5, False), (1.5, False)])
@@ -1301,20 +1286,22 @@ def test_sfm_asks_for_its_place_first(pycolmap, monkeypatch):
     pycolmap.extract_features.assert_not_called()
 
 
-def fail(function, error):
-    return lambda model: setattr(sys.modules["pycolmap"], function, mock.Mock(side_effect=error))
+def use(pycolmap):
+    return lambda model: sys.modules.update(pycolmap=pycolmap)
+
+
+DAMAGED = mock.Mock(**{"extract_features.side_effect": RuntimeError("no table")})
 
 
 @cases(
     "spoil, says",
     has_model=(new(SPARSE / "0/images.bin"), "place has sparse/ or dense/, a model: leave --sfm"),
     no_photos=(move(IMAGES), "place has no photos"),
-    damaged=(fail("extract_features", RuntimeError("no table")), "(no table): delete data/sfm"),
+    damaged=(use(DAMAGED), "(no table): delete data/sfm"),
     heic=(new(IMAGES / "phone.jpg", HEIC), "phone.jpg is HEIC: convert all such photos"),
     no_utf8=(move(PHOTO, IMAGES / "\udcff.png"), "is not UTF-8: rename the photo"),
-    no_pycolmap=(lambda model: sys.modules.update(pycolmap=None), 'run pip install "pycolmap>='),
-    old_pycolmap=(lambda model: sys.modules.update(pycolmap=SimpleNamespace()),
-                  'no attribute \'ImageReaderOptions\'): run pip install "pycolmap>=3.13"'),
+    no_pycolmap=(use(None), 'run pip install "pycolmap>=3.13"'),
+    old_pycolmap=(use(SimpleNamespace()), "no attribute 'ImageReaderOptions'): run pip install"),
     no_match=(lambda model: None, "do not match: take more"))
 def test_sfm_tells_what_is_wrong(pycolmap, model, spoil, says):
     pycolmap.incremental_mapping.side_effect = lambda *_: {}
