@@ -717,7 +717,6 @@ def twins(first, second, has_table=True):
     no_camera=(change("camera_ids", 0, 12345), "no camera in the model"),
     panorama=(change("cameras", 0, [1, 33000, 9, 99, 99, 9, 9]), "is 33000 x 9 pixels, too large"),
     wrong_pose=(change("poses", (0, 4), 99), "shows 0% of its points"),
-    folding=(change("cameras", 0, [2, 24, 32, 26, 12, 16, 300]), "wrong pose or distortion"),
     empty=(new(PHOTO, b""), "is empty, damaged, too large or of an unknown type"),
     heic=(new(PHOTO, HEIC), "is HEIC, which cannot be read"),
     cut_png=(new(PHOTO, encoded(BLACK)[:-20]), "is cut off"),
@@ -830,7 +829,6 @@ LISTS = {
 
 @cases(
     "files, flags, first",
-    tabs=({"s.tsv": ROWS}, "", "s.tsv"),
     nameless_column=({"s.tsv": "\t" + ROWS.replace("\n", "\n\t")}, "", "s.tsv"),
     commas=({"nerfw_split.csv": ROWS.replace("\t", ",")}, "", "nerfw_split.csv"),
     of_windows=({"s.csv": OF_WINDOWS}, "", "s.csv"),
@@ -864,10 +862,6 @@ def test_a_remembered_split_may_not_vanish(model):
 
 
 # ---- freshness -----------------------------------------------------------------------------------
-def append(path):
-    return lambda model: path.write_bytes(path.read_bytes() + b"\n")
-
-
 def touch_all(model):
     for path in Path("place").rglob("*.*"):
         os.utime(path, (1000, 1000))
@@ -876,18 +870,17 @@ def touch_all(model):
 @cases(
     "happens, is_made",
     other_times=(touch_all, False),
-    hidden_file=(new("place/.DS_Store"), False),
     notes=(new("place/notes.txt"), False),
     table_without_split=(new("place/notes.csv"), False),
     photo_without_pose=(new(IMAGES / "without_pose.png"), False),
     unused_masks=(new("place/unmasked_old/toy_000.png"), False),
     sources_gone=(move(Path("place")), False),
     other_size=(lambda model: data_prep.open_scene("place", 4), True),
-    other_photo=(append(PHOTO), True),
-    other_cameras=(append(SPARSE / "cameras.bin"), True),
-    other_poses=(append(SPARSE / "images.bin"), True),
-    other_points=(append(SPARSE / "points3D.bin"), True),
-    other_split=(append(TABLE), True),
+    other_photo=(new(PHOTO, encoded(BLACK)), True),
+    other_camera=(change("cameras", 0, [1, 24, 32, 40, 40, 12, 16]), True),
+    other_pose=(change("poses", (0, 4), 99), True),
+    other_point=(change("x", 0, 9), True),
+    other_split=(move(TABLE, Path("place/other.csv")), True),
     new_mask=(new(MASKS / "toy_000.png", encoded(BLACK)), True),
     photo_renamed=(move(PHOTO, IMAGES / "other.png"), True),
     second_model=(lambda model: write_model(model, Path("place/more")), True))
@@ -933,7 +926,6 @@ BLACK_LEFT = np.repeat([[0, 255]], 24, 1)[[0] * 64]  # twice as large as the pho
 @cases(
     "name, mask",
     beside=("toy_000.png", "dense/masks/toy_000.png"),
-    within=("toy_000.png", "dense/images/masks/toy_000.png"),
     in_capitals=("toy_000.JPG", "MASKS/TOY_000.PNG"),
     of_the_stem=("toy_000.jpg", "masks/toy_000.png"),
     of_the_name=("toy_000.jpg", "masks/toy_000.jpg.png"),
@@ -955,7 +947,6 @@ def test_black_pixels_of_masks_are_left_out(in_tmp_dir, name, mask):
 
 @cases(
     "file, share",
-    png=(with_alpha(".png"), 1 / 4),
     png_of_16_bits=(with_alpha(".png", np.uint16), 1 / 4),
     tiff=(with_alpha(".tiff"), 1 / 4),
     webp=(with_alpha(".webp"), 1 / 4),
@@ -1158,17 +1149,15 @@ def server(in_tmp_dir, monkeypatch):
 
     def urlopen(request, timeout):
         name = Path(request.selector).name
-        data = server.files[name]
-        start = 0
-        if server.status == 206:
-            start = int(request.headers["Range"][6:-1])
+        start = int(request.headers["Range"][6:-1]) if server.status == 206 else 0
+        rest = server.files[name][start:]
         server.asked.append((name, start))
-        if start >= len(data):
+        if not rest:
             raise HTTPError(name, 416, "no such bytes", {}, None)
-        return contextlib.nullcontext(SimpleNamespace(
-            status=server.status,
-            headers={"Content-Length": len(data) - start},
-            read=io.BytesIO(data[start:][:server.limit]).read))
+        headers = {"Content-Length": len(rest)}
+        read = io.BytesIO(rest[:server.limit]).read
+        answer = SimpleNamespace(status=server.status, headers=headers, read=read)
+        return contextlib.nullcontext(answer)
     monkeypatch.setattr(data_prep, "urlopen", urlopen)
     return server
 
