@@ -567,11 +567,11 @@ def test_the_largest_model_is_taken_and_leftovers_told(model):
     opencv=(4, [70, 72], [.1, 0, .05, -.01]),
     full_opencv=(6, [70, 72], [.1, 0, .01, -.01, 0, 0, 0, .5]))
 def test_small_straight_photos_agree_with_their_camera(model, kind, focal, distortion):
-    v, u = np.indices((61, 91)) + .5
+    v, u = np.indices((60, 92)) + .5
     put(PHOTO, encoded((u + 2 * v).round()))
     put(MASKS / "toy_000.png", encoded((u > 50) * 255))
     put(IMAGES / "toy_007.png", encoded(np.tile([0, 0, 255], (32, 8))))
-    model.cameras[0] = [kind, 91, 61, *focal, 44, 31, *distortion]
+    model.cameras[0] = [kind, 92, 60, *focal, 44, 31, *distortion]
     model.sightings[0] = []
     write_model(model)
     scene = data_prep.prepare("place", 3)
@@ -839,7 +839,7 @@ LISTS = {
 def test_a_split_is_found_read_and_remembered(model, files, flags, first):
     TABLE.unlink()
     put("place/other.csv", "a,b\n1,2\n")
-    put("place/._s.tsv", "filename\tsplit\n")  # as a Mac leaves on other disks
+    put("place/._s.tsv", "filename\tsplit\nx\ttest\n")  # as a Mac leaves on other disks
     for path, text in files.items():
         put(Path("place", path), text)
     scene, out, err = made(flags)
