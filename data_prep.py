@@ -134,7 +134,8 @@ def is_memory_full(error):
 
 
 def run_command_line(entry, go_on="start again"):
-    """Exit code 0, or 2 and one sentence on stderr; bugs raise. go_on: what to do after a stop"""
+    """Exit code 0, or 2 with one sentence on stderr; a bug keeps its traceback. go_on: what to do
+    after a stop."""
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):  # a notebook's streams print any character
             stream.reconfigure(errors="backslashreplace")  # a terminal may lack it
@@ -1188,7 +1189,8 @@ def shade(o, d, parts, background, sun, weather):
 
 
 def toy_camera(rng, azimuth, size):
-    """K (4,), c2w (3,4) in the toy's units, width, height; azimuth: angle from the front [rad]"""
+    """K (4,), c2w (3,4) in the toy's units, width and height of a tourist's camera. azimuth: its
+    angle [rad] from the front."""
     aspect = rng.choice([4 / 3, 3 / 2, 1.1, 3 / 4, 2 / 3])
     w = round(size * min(1, aspect))
     h = round(size * min(1, 1 / aspect))
@@ -1238,7 +1240,7 @@ def draw_people(rng, w, h, share):
 
 def toy_points(rng, photos, surface, seen):
     """Points (P,5) of build_scene, noisy and 1.5 % of them wrong, as by SfM; sets tracks. For each
-    photo, surface: points (h*w,3) of its pixels; seen: their distances (h*w,), inf at a person"""
+    photo, surface: points (h*w,3) of its pixels; seen: their distances (h*w,), inf at a person."""
     samples = []
     count = 3000 // len(photos)
     for x, t in zip(surface, seen):
@@ -1346,6 +1348,7 @@ def surface_truth(scene, surface, background, landmark):
 
     def sdf(x):  # (P,3) -> (P,), scene units
         return toy_sdf(x * scale + center, background, landmark) / scale
+
     wall = (surface * TOY_SCALE + TOY_ORIGIN - center) / scale
     wall = wall[lengths(wall) < 0.95]
     normal = gradient(sdf, wall, 0.004)
