@@ -2202,19 +2202,19 @@ CPU = torch.device("cpu")
 
 
 @cases(
-    "processes, energy, wanted",
-    fails_at_once=(1, {"GPU-0": []}, []),
-    fails_after_one=(1, {"GPU-0": [9000]}, []),
-    fails_later=(1, {"GPU-0": [1000, 1000, 4000, 8000]}, [50, 53, 57]),
-    of_two_gpus=(2, {"GPU-0": [1000, 2000], "GPU-1": [5000, 7000]}, [53]))
-def test_a_meter_adds_until_its_counter_fails(monkeypatch, capsys, processes, energy, wanted):
+    "energy, wanted",
+    fails_at_once=({"GPU-0": []}, []),
+    fails_after_one=({"GPU-0": [9000]}, []),
+    fails_later=({"GPU-0": [1000, 1000, 4000, 8000]}, [50, 53, 57]),
+    of_two_gpus=({"GPU-0": [1000, 2000], "GPU-1": [5000, 7000]}, [53]))
+def test_a_meter_adds_until_its_counter_fails(monkeypatch, capsys, energy, wanted):
     nvml = SimpleNamespace(
         nvmlInit=mock.Mock(),
         nvmlDeviceGetHandleByUUID=str,
         nvmlDeviceGetTotalEnergyConsumption=lambda gpu: energy[gpu].pop(0))
     monkeypatch.setitem(sys.modules, "pynvml", nvml)
     monkeypatch.setattr(torch.cuda, "get_device_properties", lambda n: SimpleNamespace(uuid=n))
-    processes = geonvs.Processes(processes)
+    processes = geonvs.Processes(len(energy))
     assert list(geonvs.metered_joules(torch.device("cuda"), 50.0, processes)) == wanted
     assert capsys.readouterr().out.count("energy is null") == 1
     nvml.nvmlInit.assert_called_once()
