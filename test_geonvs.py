@@ -1902,17 +1902,17 @@ def plain_phi(model, rays, hits):
     if is_printed:
         is_outside = hits.x[:, 0].norm(dim=1).numpy() > 1.001  # such a ray misses the sphere
         assert is_outside.any()
-        phi = torch.tensor(np.where(is_outside, 0, complexity)).sigmoid()
-        return np.where(rays.is_masked, 0, phi)
+        complexity[is_outside] = 0
+        return np.where(rays.is_masked, 0, 1 / (1 + np.exp(-complexity)))
     opacity = np.where(rays.is_masked, 0, hits.opacity.detach())
     x = np.log(complexity + 1e-3)
     mean = np.average(x, weights=opacity)
     deviation = np.average((x - mean) ** 2, weights=opacity) ** 0.5
-    return opacity * torch.tensor((x - mean) / deviation).sigmoid().numpy()
+    return opacity / (1 + np.exp((mean - x) / deviation))
 
 
 def plain_mask(model, rays, r, error, threshold, done):
-    """M of ray r, its L_reg, and the share of it that L_rgb leaves out."""
+    """M of ray r, its L_reg, and the share of its residual that L_rgb leaves out."""
     photo = rays.photo[r].item()
     logit, = geonvs.sample_logits(model.mask.logits([photo]), rays.uv[r])
     if done >= 0.6:
