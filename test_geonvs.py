@@ -3193,6 +3193,7 @@ def test_each_setting_is_used_and_explained(monkeypatch):
 class Rival(nn.Module):
     """What training and scoring ask of any model, where it does nothing special."""
     octrees = []
+    has_mask = False
     adam = dict(betas=(0.9, 0.999), eps=1e-8)
     batch = geonvs.GeoNVS.batch
     codes = geonvs.GeoNVS.codes
@@ -3200,7 +3201,6 @@ class Rival(nn.Module):
     def __init__(self, cfg, scene):
         super().__init__()
         self.cfg = replace(cfg)
-        self.has_mask = False
         self.scene = scene
 
     def groups(self):
@@ -3210,6 +3210,12 @@ class Rival(nn.Module):
         pass
 
     refresh_cache = raise_zeta = refine = do_nothing
+
+    def render(self, rays, code):
+        """Colours under codes (R,A). A rival has no surface: opacity, depth and normals are 0."""
+        rgb = self.colors(rays, code)
+        none = torch.zeros_like(rgb)
+        return geonvs.Rendering(rgb, none[:, 0], none[:, 0], none)
 
 
 def layers(*sizes):
@@ -3269,10 +3275,8 @@ class NeRFW(Rival):
         half = cfg.hidden // 2
         self.head = nn.Sequential(layers(2 * half + 16, *[half] * 4), nn.Linear(half, 5))
 
-    def render(self, rays, code):
-        out = self.trace(rays, code)
-        none = torch.zeros_like(out["rgb"])  # it has no normals
-        return geonvs.Rendering(out["rgb"], none[:, 0], out["depth"], none)
+    def colors(self, rays, code):
+        return self.trace(rays, code)["rgb"]
 
     def trace(self, rays, code, other=None, gen=None):
         """Coarse and fine pass with n samples and 2n, as in GeoNVS.trace. other: codes (R,16)
@@ -3287,8 +3291,7 @@ class NeRFW(Rival):
         t_fine = geonvs.inverse_cdf(edges, weight, geonvs.stratified(rays, n, gen))  # (R,n)
         t, _ = torch.cat([t, t_fine], 1).sort(1)  # (R,2n)
         out = self.pass_through(self.fine, rays, t, code, other)
-        depth = (out["w"] * t).sum(1).detach()
-        return out | dict(coarse=coarse["rgb"], depth=depth)
+        return out | dict(coarse=coarse["rgb"])
 
     def pass_through(self, field, rays, t, code, other=None):
         """Densities to a picture: C = sum T (alpha_s c_s + alpha_t c_t). NeRF-W Eq. 5"""
@@ -3311,7 +3314,7 @@ class NeRFW(Rival):
         moving = torch.einsum("rs,rsc->rc", w_t, rgb_t.sigmoid())
         beta = w_t * F.softplus(beta).squeeze(2)
         beta = beta.sum(1) + 0.03
-        return dict(rgb=static + moving, w=w, sigma_t=sigma_t, beta=beta)
+        return dict(rgb=static + moving, sigma_t=sigma_t, beta=beta)
 
     def losses(self, rays, photos, done, gen):
         """Squared error over learned variance, its log, a penalty on transients. NeRF-W Eq. 13"""
@@ -3397,18 +3400,18 @@ class Splats(Rival):
     splats in the wild have one."""
     name = "splats"
     adam = dict(betas=(0.9, 0.999), eps=1e-15)
-    mask_rays = geonvs.GeoNVS.transients
+    transients = geonvs.GeoNVS.transients
 
     def __init__(self, cfg, scene):
         super().__init__(cfg, scene)
         radius = scene.points.norm(dim=1).max().clamp(min=3)
         sky = F.normalize(torch.randn(SHELL, 3))
         center = torch.cat([scene.points, 2 * radius * sky])  # (N,3)
-        gaps = []
-        for some in center.split(1024):
-            nearest, _ = torch.cdist(some, center).topk(4, largest=False)
-            gaps.append(nearest[:, 1:].mean(1, keepdim=True))  # to three neighbours
-        size = 0.3 * torch.cat(gaps).clamp(min=1e-4)  # (N,1)
+        nearest = [
+            torch.cdist(some, center).topk(4, largest=False).values
+            for some in center.split(1024)]
+        gap = torch.cat(nearest)[:, 1:].mean(1, keepdim=True)  # (N,1) to three neighbours
+        size = 0.3 * gap.clamp(min=1e-4)  # (N,1)
         N = len(center)
         self.center = nn.Parameter(center)
         self.log_size = nn.Parameter(size.log().repeat(1, 3))
@@ -3418,10 +3421,9 @@ class Splats(Rival):
         self.paint = geonvs.mlp(FEATURE + cfg.appearance_dim, cfg.hidden, 3)
         self.appearance = nn.Embedding(len(scene.wh), cfg.appearance_dim)
         nn.init.normal_(self.appearance.weight, std=0.01)
-        self.has_mask = cfg.mask != "off"
-        if self.has_mask:
-            self.mask = geonvs.TransientMask(scene.thumbs)
-            self.usual_errors = geonvs.UsualErrors()
+        self.has_mask = cfg.mask == "on"
+        self.mask = geonvs.TransientMask(scene.thumbs) if self.has_mask else None
+        self.usual_errors = geonvs.UsualErrors()
 
     def groups(self):
         rates = dict(
@@ -3446,7 +3448,7 @@ class Splats(Rival):
         rays = geonvs.make_rays(self.scene, picked.expand_as(pixel), pixel)
         return rays, picked
 
-    def render(self, rays, code):
+    def colors(self, rays, code):
         """The rays of each photo at once, under the code of the first of them. The geometry has no
         gradient here."""
         rgb = torch.zeros_like(rays.rgb)
@@ -3457,8 +3459,7 @@ class Splats(Rival):
             xy = rays.uv[mine, None] * self.scene.wh[photo]  # (R,1,2) px, each ray a tile
             picture, _ = self.draw(view, code[mine][0], xy)
             rgb[mine] = picture[:, 0]
-        none = torch.zeros_like(rgb)
-        return geonvs.Rendering(rgb, none[:, 0], none[:, 0], none)
+        return rgb
 
     def view(self, photo):
         """Which Gaussians a photo sees, front first (N,); their centres (N,2) px and covariances
@@ -3501,23 +3502,15 @@ class Splats(Rival):
         tiles = xy.view(-1, TILE**2, 2)
         rgb, distance = self.draw(self.view(photo), self.appearance.weight[photo], tiles)
         rgb = rgb.flatten(0, 1)  # (R,3)
-        distance = distance.flatten(0, 1)  # (R,1)
         residual = (rgb - rays.rgb).abs()
-        left_out, reg = self.transients(rays, photos, residual.detach().amax(1), distance, done)
+        error = residual.detach().amax(1)  # (R,) of the worst channel
+        place = geonvs.contract(rays.at(distance.flatten(0, 1))[:, 0])  # (R,3)
+        no_edges = torch.zeros_like(error)  # Phi
+        left_out, reg, _ = self.transients(rays, photos, place, no_edges, error, done)
+        self.usual_errors.update(place, error, ~rays.is_masked)
         loss = ((1 - left_out) * residual.mean(1)).mean()
         mse = residual.detach().square().mean()
         return loss + reg, dict(rgb=loss, reg=reg, mse=mse)
-
-    def transients(self, rays, photos, error, distance, done):
-        """What the loss leaves out (R,), and L_reg: GeoNVS.transients, with Phi 0, at the places at
-        distance (R,1)."""
-        none = torch.zeros_like(error)
-        if not self.has_mask:
-            return none, none.sum()
-        place = geonvs.contract(rays.at(distance)[:, 0])  # (R,3)
-        left_out, reg, _ = self.mask_rays(rays, photos, place, none, error, done)
-        self.usual_errors.update(place, error, ~rays.is_masked)
-        return left_out, reg
 
 
 # ---- Other forms of the method -------------------------------------------------------------------
@@ -3802,16 +3795,13 @@ def draw():
 
 
 def spread_out(values, gap):
-    """Numbers (N,) moved apart in their order, so that neighbours are at least gap apart: the mean
-    of moving them only up and moving them only down."""
-    order = np.argsort(values)
+    """Ascending numbers (N,) moved apart, so that neighbours are at least gap apart: the mean of
+    moving them only up and moving them only down."""
     even = gap * np.arange(len(values))
-    free = np.asarray(values)[order] - even
+    free = values - even
     up = np.maximum.accumulate(free)
     down = np.minimum.accumulate(free[::-1])[::-1]
-    moved = np.empty(len(values))
-    moved[order] = (up + down) / 2 + even
-    return moved
+    return (up + down) / 2 + even
 
 
 def draw_chart(axis, table):
@@ -3820,25 +3810,24 @@ def draw_chart(axis, table):
     curves = defaultdict(list)
     for line in table:
         method, _ = line["row"].split(" x")
-        curves[method].append(line)
-    budgets = [line["train_seconds"] for line in list(curves.values())[0]]
+        curves[method].append([line[key] for key in ("train_seconds", "psnr", "psnr_std")])
+    budgets, _, _ = np.transpose(next(iter(curves.values())))  # of the first method
     axis.set(xscale="log", xlabel="training, s", ylabel="PSNR, dB")
     axis.set_xticks(budgets, [f"{seconds:.0f}" for seconds in budgets])
     axis.minorticks_off()
     floor = table[0]["psnr_floor"]
     axis.axhline(floor, color="grey", ls=":")
-    ends = [("baseline", budgets[-1], floor, "grey")]
+    ends = [(floor, budgets[-1], "baseline", "grey")]
     for number, (method, curve) in enumerate(curves.items()):
-        aside = 1.06 ** (number - len(curves) / 2)
-        seconds = [aside * line["train_seconds"] for line in curve]
-        psnr = [line["psnr"] for line in curve]
-        spread = [line["psnr_std"] for line in curve]
-        axis.errorbar(
-            seconds, psnr, spread, color=f"C{number}", marker="osD^vX"[number], capsize=2)
-        ends.append((method, seconds[-1], psnr[-1], f"C{number}"))
+        seconds, psnr, spread = np.transpose(curve)
+        seconds = seconds * 1.06 ** (number - len(curves) / 2)
+        color = f"C{number}"
+        axis.errorbar(seconds, psnr, spread, color=color, marker="osD^vX"[number], capsize=2)
+        ends.append((psnr[-1], seconds[-1], method, color))
+    ends.sort()  # by PSNR
     low, high = axis.get_ylim()
-    heights = spread_out([psnr for _, _, psnr, _ in ends], (high - low) / 17)
-    for (name, seconds, psnr, color), height in zip(ends, heights):
+    heights = spread_out([psnr for psnr, *_ in ends], (high - low) / 17)
+    for (psnr, seconds, name, color), height in zip(ends, heights):
         axis.annotate(
             name, (seconds, psnr), (1.04, height), va="center", color=color,
             textcoords=axis.get_yaxis_transform(), arrowprops=dict(arrowstyle="-", color=color))
@@ -3848,8 +3837,7 @@ def draw_chart(axis, table):
 
 FEW = dict(rays=64, photos=4, samples=4, bg_samples=6, hidden=16)
 RIVALS = {  # tiny
-    title: row._replace(settings=row.settings | FEW | dict(
-        rays=256, photos=min(64, row.settings["photos"])))
+    title: row._replace(settings=row.settings | FEW)
     for title, row in METHODS.items() if issubclass(row.kind, Rival)}
 
 
@@ -3880,20 +3868,19 @@ def test_nerfw_mixes_static_and_transient_as_its_equation_says(scene):
     other = torch.ones(64, 16)
     sigma, rgb, neck = model.fine(rays.at(t), rays.d, code)
     out = model.pass_through(model.fine, rays, t, code, other)
-    for r in range(3):
-        passes = 1.0
-        color = 0
-        beta = 0.03
-        for s, dt in enumerate((0.5, 0.2, 100.0)):
-            h = model.head(torch.cat([neck[r, s], other[r]]))
-            static = 1 - torch.exp(-sigma[r, s] * dt)
-            moving = 1 - torch.exp(-F.softplus(h[0]) * dt)
-            color += passes * static * rgb[r, s]
-            color += passes * moving * h[1:4].sigmoid()
-            beta += passes * moving * F.softplus(h[4])
-            passes *= (1 - static) * (1 - moving)
-        assert_tensors_close(out["rgb"][r], color, 1e-4)
-        assert_tensors_close(out["beta"][r], beta, 1e-4)
+    passes = 1.0
+    color = 0
+    beta = 0.03
+    for i, dt in enumerate((0.5, 0.2, 100.0)):
+        h = model.head(torch.cat([neck[:, i], other], 1))  # (64,5)
+        static = 1 - torch.exp(-sigma[:, i, None] * dt)  # (64,1)
+        moving = 1 - torch.exp(-F.softplus(h[:, :1]) * dt)
+        color += passes * static * rgb[:, i]
+        color += passes * moving * h[:, 1:4].sigmoid()
+        beta += passes * moving * F.softplus(h[:, 4:])
+        passes = passes * (1 - static) * (1 - moving)
+    assert_tensors_close(out["rgb"], color, 1e-4)
+    assert_tensors_close(out["beta"], beta[:, 0], 1e-4)
 
 
 def test_opacities_of_a_density_follow_the_lengths_between_its_samples(scene):
@@ -3902,11 +3889,8 @@ def test_opacities_of_a_density_follow_the_lengths_between_its_samples(scene):
     t0 = torch.full((64, 1), 0.5)
     t = model.sample(rays, t0, t0 + 2)
     sdf = torch.tensor([0.3, 0.1, -0.1, -0.3, 0.2]).repeat(64, 1)
-    alpha = model.alpha(sdf)
-    for i in range(4):
-        sigma = math.exp(-5 * (sdf[0, i] + sdf[0, i + 1]))
-        length = t[:, i + 1] - t[:, i]
-        assert_tensors_close(alpha[:, i], 1 - torch.exp(-sigma * length), 1e-4)
+    sigma = torch.exp(-5 * (sdf[:, :-1] + sdf[:, 1:]))  # (64,4)
+    assert_tensors_close(model.alpha(sdf), 1 - torch.exp(-sigma * t.diff()), 1e-4)
 
 
 def test_a_uniform_grid_has_every_cell_of_its_last_level(scene):
@@ -3917,24 +3901,23 @@ def test_a_uniform_grid_has_every_cell_of_its_last_level(scene):
 
 # ---- Splats
 
-def test_splats_equal_a_loop_over_pixels_and_gaussians(monkeypatch):
+def test_splats_equal_a_loop_over_gaussians(monkeypatch):
     monkeypatch.setitem(globals(), "REACH", 9.0)
     center, xy = 20 * torch.rand(9, 2), 20 * torch.rand(5, 6, 2)
     half = 3 * torch.randn(9, 2, 2)
     cov = half @ half.mT + torch.eye(2)
     opacity, rgb = torch.rand(9), torch.rand(9, 3)
+    color = torch.zeros(5, 6, 3)
+    passes = torch.ones(5, 6, 1)
+    for n in range(9):
+        d = xy - center[n]  # (5,6,2)
+        power = (d @ cov[n].inverse() * d).sum(2, keepdim=True) / 2
+        alpha = opacity[n] * torch.exp(-power)  # (5,6,1)
+        color += passes * alpha * rgb[n]
+        passes *= 1 - alpha
     picture, trans = splat(center, cov, opacity, rgb, xy)
-    for place in itertools.product(range(5), range(6)):
-        color = 0
-        passes = 1.0
-        for n in range(len(center)):
-            d = xy[place] - center[n]
-            power = d @ cov[n].inverse() @ d / 2
-            alpha = opacity[n] * torch.exp(-power)
-            color += passes * alpha * rgb[n]
-            passes *= 1 - alpha
-        assert_tensors_close(picture[place], color, 1e-4)
-        assert_tensors_close(trans[place], passes, 1e-4)
+    assert_tensors_close(picture, color, 1e-4)
+    assert_tensors_close(trans, passes[..., 0], 1e-4)
 
 
 def test_a_projected_gaussian_has_the_spread_of_projected_samples():
@@ -3956,14 +3939,11 @@ def test_a_view_shows_gaussians_where_the_rays_through_them_are(scene):
     order, center, _, _ = model.view(1)
     depth = (model.center[order] - scene.c2w[1, :, 3]) @ scene.c2w[1, :, 2]
     assert (depth.diff() >= 0).all()  # front first
-    rays = geonvs.photo_rays(scene, 1)
-    w, h = scene.wh[1].tolist()
-    for n in range(0, len(order), 97):
-        col, row = center[n].long().tolist()
-        if 0 <= col < w and 0 <= row < h:
-            ray = row * w + col
-            to_center = F.normalize(model.center[order[n]] - rays.o[ray], dim=0)
-            assert (to_center - rays.d[ray]).norm() < 1.5 / scene.K[1, 0]
+    is_inside = ((center >= 0) & (center < scene.wh[1])).all(1)  # (N,)
+    col, row = center[is_inside].long().unbind(1)
+    rays = geonvs.make_rays(scene, torch.ones_like(col), row * scene.wh[1, 0] + col)
+    to_center = F.normalize(model.center[order[is_inside]] - rays.o)
+    assert ((to_center - rays.d).norm(dim=1) < 1.5 / scene.K[1, 0]).all()
 
 
 def test_splats_render_a_ray_alike_among_any_others(scene):
@@ -4077,15 +4057,15 @@ def test_a_chart_shows_each_method_and_the_baseline_and_none_hides_another():
         assert_arrays_close(np.log(curve[:, 0] / [15, 60]), 0, atol=0.1)
     assert (abs(np.log(curves[0] / curves[1])[:, 0]) > 0.03).all()
     heights = {text.get_text(): text.xyann[1] for text in axis.texts}
-    assert list(heights) == ["baseline", *values]
+    assert set(heights) == {"baseline", *values}
     assert heights["theirs"] - heights["ours"] > 0.5 and abs(heights["old"] - 17) < 0.5
 
 
 def test_numbers_that_are_close_are_spread_out_in_their_order():
-    assert_arrays_close(spread_out([5.0, 1.0, 1.5], 1), [5, 0.75, 1.75])
-    moved = spread_out([3.0, 3.0, 2.9, 9.0], 0.5)
-    assert (np.diff(np.sort(moved)) > 0.499).all()
-    assert moved[2] < moved[0] and moved[3] == 9
+    assert_arrays_close(spread_out([1.0, 1.5, 5.0], 1), [0.75, 1.75, 5])
+    moved = spread_out([2.9, 3.0, 3.0, 9.0], 0.5)
+    assert (np.diff(moved) > 0.499).all()
+    assert moved[3] == 9
 
 
 if __name__ == "__main__":
