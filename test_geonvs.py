@@ -3194,7 +3194,6 @@ class Rival(nn.Module):
     """What training and scoring ask of any model, where it does nothing special."""
     octrees = []
     has_mask = False
-    adam = dict(betas=(0.9, 0.999), eps=1e-8)
     batch = geonvs.GeoNVS.batch
     codes = geonvs.GeoNVS.codes
 
@@ -3204,7 +3203,8 @@ class Rival(nn.Module):
         self.scene = scene
 
     def groups(self):
-        return [dict(params=list(self.parameters()), base_lr=self.cfg.lr_net, **self.adam)]
+        params = list(self.parameters())
+        return [dict(params=params, base_lr=self.cfg.lr_net, betas=(0.9, 0.999), eps=1e-8)]
 
     def do_nothing(self, *_):
         pass
@@ -3399,7 +3399,6 @@ class Splats(Rival):
     network makes its colour of that and a photo's code. The transient mask is this project's, as
     splats in the wild have one."""
     name = "splats"
-    adam = dict(betas=(0.9, 0.999), eps=1e-15)
     transients = geonvs.GeoNVS.transients
 
     def __init__(self, cfg, scene):
@@ -3430,7 +3429,7 @@ class Splats(Rival):
             center=2e-3, log_size=5e-2, turn=2e-2, opacity=5e-2, feature=2e-2, paint=2e-3,
             appearance=self.cfg.lr_code, mask=self.cfg.lr_mask)
         return [
-            dict(params=[value], base_lr=rates[name.split(".")[0]], **self.adam)
+            dict(params=[value], base_lr=rates[name.split(".")[0]], betas=(0.9, 0.999))
             for name, value in self.named_parameters()]
 
     def batch(self, n, gen):
@@ -3835,9 +3834,8 @@ def draw_chart(axis, table):
 
 # ---- Tests of Part II ----------------------------------------------------------------------------
 
-FEW = dict(rays=64, photos=4, samples=4, bg_samples=6, hidden=16)
-RIVALS = {  # tiny
-    title: row._replace(settings=row.settings | FEW)
+RIVALS = {
+    title: row._replace(settings=row.settings | TINY)
     for title, row in METHODS.items() if issubclass(row.kind, Rival)}
 
 
@@ -3884,17 +3882,17 @@ def test_nerfw_mixes_static_and_transient_as_its_equation_says(scene):
 
 
 def test_opacities_of_a_density_follow_the_lengths_between_its_samples(scene):
-    model = Density(geonvs.Config(**FEW), scene)
+    model = Density(geonvs.Config(**TINY), scene)
     rays, _ = model.batch(64, generator())
     t0 = torch.full((64, 1), 0.5)
     t = model.sample(rays, t0, t0 + 2)
-    sdf = torch.tensor([0.3, 0.1, -0.1, -0.3, 0.2]).repeat(64, 1)
-    sigma = torch.exp(-5 * (sdf[:, :-1] + sdf[:, 1:]))  # (64,4)
+    sdf = random(*t.shape, low=-0.3, high=0.3)
+    sigma = torch.exp(-5 * (sdf[:, :-1] + sdf[:, 1:]))
     assert_tensors_close(model.alpha(sdf), 1 - torch.exp(-sigma * t.diff()), 1e-4)
 
 
 def test_a_uniform_grid_has_every_cell_of_its_last_level(scene):
-    octree = UniformGrid(geonvs.Config(**FEW, levels=3), scene).sdf.octree
+    octree = UniformGrid(geonvs.Config(**TINY), scene).sdf.octree
     assert octree.cells[:, 0].bincount().tolist() == [16**3, 32**3, 64**3]
     assert octree.features.all()
 
@@ -3970,13 +3968,13 @@ def quick_rows(monkeypatch, in_tmp_dir):
     methods = {"Geo-NVS-w": Row(), "splats": RIVALS["splats"], "NeRF-W": RIVALS["NeRF-W"]}
     monkeypatch.setitem(globals(), "METHODS", methods)
     monkeypatch.setitem(globals(), "STRESS", {"crowd": STRESS["crowd"]})
-    return [f"--{key}={value}" for key, value in FEW.items()]
+    return [f"--{key}={value}" for key, value in TINY.items()]
 
 
 @functools.cache
 def last_line(title):
     """Of a training's log, without its time."""
-    run_row(Path(title), FEW | dict(steps=4, levels=3), (PARTS | GRID)[title])
+    run_row(Path(title), TINY, (PARTS | GRID)[title])
     line = Path(title, "log.jsonl").read_text().splitlines()[-1]
     return json.loads(line) | dict(seconds=0)
 
@@ -3991,7 +3989,7 @@ def test_each_row_of_parts_and_grid_changes_the_training(quick_rows, title, monk
 def test_an_experiment_writes_and_prints_a_table_and_reads_trainings_again(
         quick_rows, name, rows, monkeypatch, capsys):
     monkeypatch.setitem(globals(), "PARTS", {k: PARTS[k] for k in ("Geo-NVS-w", "no mask")})
-    argv = [name, "--steps=4", "--seeds=1", *quick_rows]
+    argv = [name, "--seeds=1", *quick_rows]
     experiment(argv)
     table = Path(f"{name}.csv").read_text()
     assert len(table.splitlines()) == 1 + rows
