@@ -2499,15 +2499,6 @@ def test_a_bad_checkpoint_is_refused_in_one_sentence(in_tmp_dir):
     assert not Path("harm").exists()
 
 
-@pytest.fixture
-def saved(in_tmp_dir, warm):
-    """The dictionary of a checkpoint from before the first step."""
-    optimizer = geonvs.make_optimizer(warm)
-    terms = dict(mse=torch.tensor(0.1))
-    geonvs.save(RUN, warm, optimizer, generator(), geonvs.State(), terms)
-    return read_saved()
-
-
 def one(shape, place):
     """An array with a one at a place of the flattened array, and zeros elsewhere."""
     return (np.arange(math.prod(shape)) == place).reshape(shape)
@@ -2534,30 +2525,32 @@ def reverse_photos(raw):
     points=(lambda a: dict(points=a["points"] + np.float32(1e-3)), "1 .*the sphere"),
     center=(lambda a: dict(center=a["center"] + [0, 0, 1e-3]), "1 .*the sphere"),
     scale=(lambda a: dict(scale=a["scale"] * 1.001), ".*the sphere"))
-def test_a_checkpoint_of_another_scene_is_refused(saved, warm, changes, says):
+def test_a_checkpoint_of_another_scene_is_refused(whole, warm, changes, says):
     raw = warm.scene.raw
     other = raw | changes(raw)
     thumbs = geonvs.load_scene(raw | dict(rgb=other["rgb"])).thumbs
     warm.scene = warm.scene._replace(raw=other, thumbs=thumbs)
     with pytest.raises(UserError, match=f"points: {says}"):
-        geonvs.restore(saved, warm, generator())
+        geonvs.restore(whole.saved, warm, generator())
 
 
 @cases(
     "key, value, says",
     of_a_gpu=("generator", torch.zeros(16).byte(), "kind of device"),
     unknown_setting=("config", dict(lam_old=1.0), "version.*lam_old"))
-def test_a_checkpoint_of_something_else_is_refused(saved, warm, key, value, says):
-    torch.save(saved | {key: value}, CHECKPOINT)
+def test_a_checkpoint_of_something_else_is_refused(
+        whole, warm, in_tmp_dir, key, value, says):
+    RUN.mkdir(parents=True)
+    torch.save(whole.saved | {key: value}, CHECKPOINT)
     with pytest.raises(UserError, match=says):
         geonvs.restore(read_saved(), warm, generator())
 
 
-def test_a_checkpoint_fits_its_own_settings_alone(saved, scene):
+def test_a_checkpoint_fits_its_own_settings_alone(whole, scene):
     raw = scene.raw | dict(c2w=scene.raw["c2w"] + 1e-9)  # another machine's rounding
     info = dict(scene="toy", kind="colmap", folder="/elsewhere")
     model = make_model(scene._replace(raw=raw, info=info), lr_net=1e-4)
-    saved["generator"] = torch.zeros(16).byte()  # of a GPU, to render
+    saved = whole.saved | dict(generator=torch.zeros(16).byte())  # of a GPU, to render
     model.sdf.octree.split(model.sdf.octree.cells)  # a new model may have other cells
     optimizer, _ = geonvs.restore(saved, model)
     assert torch.equal(model.sdf.octree.features, saved["model"]["sdf.octree.features"])
