@@ -1845,6 +1845,16 @@ def test_a_new_model_shows_a_small_ball(warm, aside, opacity, depth):
 
 # ---- 6 photos in the wild ------------------------------------------------------------------------
 
+def test_logits_that_are_linear_in_the_photo_are_read_so():
+    u = (torch.arange(8) + 0.5) / 8  # centres of pixels
+    v = (torch.arange(4) + 0.5) / 4
+    first = (u - 3 * v[:, None])[None]  # (1,4,8)
+    uv = random(20, 2, low=0.2, high=0.8)
+    found = geonvs.sample_logits(torch.stack([first, first + 5]), uv)  # ten rays of each
+    wanted = uv @ torch.tensor([1.0, -3.0]) + 5 * (torch.arange(20) >= 10)
+    assert_tensors_close(found, wanted)
+
+
 def test_the_mask_starts_low_at_half_size(warm):
     mask = warm.mask
     logits = mask.logits([0, 1, 2])
