@@ -921,7 +921,8 @@ def prepare(name, downscale=2, split=None):
 def scene_path(name_or_folder):
     """data/<scene>.npz; folders get a suffix, so that two of one name do not share a file."""
     folder = Path(name_or_folder).resolve()
-    mark = "" if name_or_folder in ("toy", *SCENES) else f"-{zlib.crc32(os.fsencode(folder)):08x}"
+    is_known = name_or_folder in ("toy", *SCENES)
+    mark = "" if is_known else f"-{zlib.crc32(os.fsencode(folder)):08x}"
     return DATA / f"{folder.name[:50]}{mark}.npz"  # a file's name has 255 bytes at most
 
 
@@ -1235,7 +1236,8 @@ def draw_people(rng, w, h, share):
             ends = feet + np.array([begin, end]) * (height, -height)
             cv2.line(canvas, *ends.astype(int), (*color, 1), int(width * height) + 1)
         left = share - canvas[..., 3].mean()
-    return cv2.resize(canvas, (w, h), interpolation=cv2.INTER_AREA).reshape(-1, 4).astype(float)
+    small = cv2.resize(canvas, (w, h), interpolation=cv2.INTER_AREA)
+    return small.reshape(-1, 4).astype(float)
 
 
 def toy_points(rng, photos, surface, seen):
@@ -1489,7 +1491,9 @@ def write_sfm_masks(files, masks, folder):
 def run_sfm(folder):
     """Finds the poses of the raw photos in a folder by pycolmap and writes folder/sparse/{0,1,...}.
     The database waits in data/ for a second try and goes after a success."""
-    images = folder / "images" if (folder / "images").is_dir() else folder
+    images = folder / "images"
+    if not images.is_dir():
+        images = folder
     sparse = folder / "sparse"
     check(not sparse.exists() and not (folder / "dense").exists(),
           f"{folder} has sparse/ or dense/, a model: leave --sfm out, or delete that")
@@ -1543,7 +1547,8 @@ def main(argv=None):
     given = vars(parser.parse_args(argv))
     name, is_download, is_sfm = [given.pop(key, None) for key in ("scene", "download", "sfm")]
     path = scene_path(name)
-    wrong = given.keys() - (knobs if name == "toy" else ("downscale", "split"))
+    allowed = knobs if name == "toy" else ("downscale", "split")
+    wrong = given.keys() - allowed
     check(not wrong, f"--{' --'.join(wrong)}: not for {name}")
     if is_download:
         download(name)

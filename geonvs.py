@@ -45,7 +45,7 @@ Departures from the printed paper. The tag stands at the code; .github/RESULTS.m
   [D2]  E_curv = |lap s|; Phi on       |lap s| h, h being the step of    |lap s| grows as h shrinks;
         every ray                      the difference; L_eik, L_curv,    rays through air have no
                                        Phi are weighted by opacity       edges
-  [D3]  L_reg: penalties of            M is trained to classify rays     up to 0.5 dB on photos;
+  [D3]  L_reg: penalties of            M is trained to classify rays     theatre: 0.5 dB, 2 seeds;
         intensity and bimodality of    by error, the threshold depends   errors are large at first,
         M, which L_rgb trains, too     on the place; outliers are        and small at last, where
                                        rejected at first; M is fixed     people have been memorised
@@ -57,7 +57,7 @@ Departures from the printed paper. The tag stands at the code; .github/RESULTS.m
                                        there; lines of sight are air
   [D6]  derivatives at every sample;   at one surface point per ray, at  each is five lookups;
         no normal as an input          SfM points and in air; colours    colours that see normals:
-                                       see the normal; samples and Phi   1 dB on a statue's photos
+                                       see the normal; samples and Phi   statue: 1 dB, two seeds
                                        read a cached SDF, so L_GPL
                                        moves M alone
   [D7]  octrees are pruned             cells split where colour errors   cells that are never made
