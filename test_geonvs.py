@@ -3599,6 +3599,7 @@ PARTS = {
     "density": METHODS["density"]}
 GRID = {"octree": Row(), "uniform grid": Row(kind=UniformGrid)}
 STRESS = {  # knobs of a toy, and the row of PARTS without what is made for it
+    "plain": (dict(photos=24), "alpha as printed"),
     "hard": (dict(photos=24, occluders=0.25, exposure=2.0, pose_noise=1.0), "no L_sfm"),
     "crowd": (dict(photos=24, occluders=0.4), "no mask"),
     "lights": (dict(photos=24, exposure=2.0), "no codes"),
