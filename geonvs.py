@@ -46,7 +46,7 @@ Departures from the printed paper. The tag stands at the code; .github/RESULTS.m
         every ray                      the difference; L_eik, L_curv,    rays through air have no
                                        Phi are weighted by opacity       edges
   [D3]  L_reg: penalties of            M is trained to classify rays     crowd: SSIM +0.014, level
-        intensity and bimodality of    by error, the threshold depends   elsewhere; errors are large
+        intensity and bimodality of    by error, the threshold depends   on photos; errors are large
         M, which L_rgb trains, too     on the place; outliers are        at first and small at last,
                                        rejected at first; M is fixed     where people have been
                                        at 60 % of training               memorised
