@@ -57,7 +57,7 @@ Departures from the printed paper. The tag stands at the code; .github/RESULTS.m
                                        there; lines of sight are air
   [D6]  derivatives at every sample;   at one surface point per ray, at  each is five lookups;
         no normal as an input          SfM points and in air; colours    colours that see normals:
-                                       see the normal; samples and Phi   statue: 1 dB, two seeds
+                                       see the normal; samples and Phi   statue: 0.75 dB
                                        read a cached SDF, so L_GPL
                                        moves M alone
   [D7]  octrees are pruned             cells split where colour errors   cells that are never made
