@@ -281,19 +281,6 @@ def load_scene(raw, device="cpu"):
     return Scene(**tensors, raw=raw, info=json.loads(str(raw["info"])))
 
 
-def find_scene(cfg, home=None):
-    """The dictionary of the scene file that settings name; the file is made on first use. home: the
-    folder in which a run was trained, if another one than here."""
-    path = data_prep.scene_path(cfg.source)
-    if home and (home / path).exists() and not home.samefile("."):
-        return data_prep.read_scene(home / path)
-    is_there = not cfg.data or Path(cfg.data).is_dir()
-    check(is_there or path.exists(),
-          f"{cfg.data} is no folder: give the folder's place by --data; a run that was trained "
-          "with its old place also needs --name")
-    return data_prep.open_scene(cfg.source, cfg.downscale)
-
-
 class Rays(NamedTuple):
     """A batch of rays; every field is indexed by the ray."""
     o: Tensor  # (R,3) origin
@@ -1529,6 +1516,19 @@ def restore(saved, model, gen=None):
         if gen:
             gen.set_state(saved["generator"])
         return optimizer, State(**saved["state"])
+
+
+def find_scene(cfg, home=None):
+    """The dictionary of the scene file that settings name; the file is made on first use. home: the
+    folder in which a run was trained, if another one than here."""
+    path = data_prep.scene_path(cfg.source)
+    if home and (home / path).exists() and not home.samefile("."):
+        return data_prep.read_scene(home / path)
+    is_there = not cfg.data or Path(cfg.data).is_dir()
+    check(is_there or path.exists(),
+          f"{cfg.data} is no folder: give the folder's place by --data; a run that was trained "
+          "with its old place also needs --name")
+    return data_prep.open_scene(cfg.source, cfg.downscale)
 
 
 def load_run(run, **given):
