@@ -300,21 +300,17 @@ class Rays(NamedTuple):
 def make_rays(scene, photo, pixel):
     """Rays through pixels. photo, pixel: (R,) index of a photo, and row-major index in it."""
     wh = scene.wh[photo]  # (R,2)
-    w = wh[:, 0]
     focal, centre = scene.K[photo].split(2, 1)  # (R,2)
     c2w = scene.c2w[photo]  # (R,3,4)
-    xy = torch.stack([pixel % w, pixel // w], 1) + 0.5  # (R,2) px
-    d = (xy - centre) / focal  # (R,2)
-    d = F.normalize(F.pad(d, (0, 1), value=1.0))  # (R,3) in camera axes
+    xy = torch.stack([pixel % wh[:, 0], pixel // wh[:, 0]], 1) + 0.5  # (R,2) px
+    d = F.normalize(F.pad((xy - centre) / focal, (0, 1), value=1.0))  # (R,3) in camera axes
     d = torch.einsum("rij,rj->ri", c2w[..., :3], d)  # (R,3) in world axes
     index = scene.start[photo] + pixel  # (R,) among all pixels
     rgb = scene.rgb[index] / 255
     uv = xy / wh  # (R,2)
     col, row = (uv * scene.sfm_pixels.shape[1]).long().unbind(1)  # (R,) of the mask's pixel
     has_sfm = scene.sfm_pixels[photo, row, col]
-    is_masked = torch.zeros_like(has_sfm)
-    if len(scene.masked):
-        is_masked = scene.masked[index]
+    is_masked = scene.masked[index] if len(scene.masked) else torch.zeros_like(has_sfm)
     return Rays(c2w[..., 3], d, scene.near[photo, None], photo, uv, rgb, has_sfm, is_masked)
 
 
@@ -337,9 +333,8 @@ def random_rays(scene, photo, gen, part=1.0):
 
 
 def sphere_interval(o, d, near):
-    """Distances (R,1), (R,1) at which rays o, d (R,3) enter and leave the unit sphere, at near
-    (R,1) or later. A ray that misses the sphere, or has it behind, gets an empty interval: at its
-    closest approach, or at near."""
+    """Distances t0, t1 (R,1) at which rays o, d (R,3) enter and leave the unit sphere, from near
+    (R,1) on. If a ray misses the sphere or has it behind, both are its closest approach or near."""
     closest = -(o * d).sum(1, keepdim=True)  # (R,1)
     distance = torch.addcmul(o, closest, d).norm(dim=1, keepdim=True)  # from the sphere's centre
     half = (1 - distance**2).clamp_min(0).sqrt()
@@ -354,13 +349,11 @@ def air_segments(scene):
     """Ends (T,2,3) of segments that are air. Where a training photo saw an SfM point, nothing
     stands between its camera and the point. A segment is the part of that line of sight in the unit
     sphere; it ends AIR_GAP before the point, or where the line leaves the sphere."""
-    photo, point = [
-        torch.as_tensor(scene.raw[key], device=scene.train.device).long()
-        for key in ("track_photo", "track_point")]
-    is_train = torch.isin(photo, scene.train)
-    photo = photo[is_train]  # (T,)
+    tracks = np.stack([scene.raw["track_photo"], scene.raw["track_point"]], 1)  # (.,2)
+    tracks = torch.as_tensor(tracks, device=scene.train.device).long()
+    photo, point = tracks[torch.isin(tracks[:, 0], scene.train)].unbind(1)  # (T,)
     o = scene.c2w[photo, :, 3]  # (T,3)
-    to_point = scene.points[point[is_train]] - o
+    to_point = scene.points[point] - o
     distance = to_point.norm(dim=1, keepdim=True)  # (T,1)
     d = to_point / distance
     t0, t1 = sphere_interval(o, d, scene.near[photo, None])
