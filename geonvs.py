@@ -401,10 +401,10 @@ def grid_index(n, device):
 
 
 def pack_index(index, base=2**13):
-    """Reads an index (...,d) as the d digits of one integer (...) in the given base, the first
-    digit being the highest. With the default base this is the key by which the octree finds a cell
-    or corner (level, i, j, k): 2^13 is more than the 2,049 corners along an axis of the finest
-    level. With base n it is the row of a cell (i, j, k) in grid_index(n)."""
+    """One integer (...) whose digits in a base are an index (...,d), the highest first. With base n
+    it is the row of a cell (i, j, k) in grid_index(n). With the default base it is the key of a
+    cell or corner (level, i, j, k) of an octree: 2^13 is more than the 2,049 corners along an axis
+    of the finest level, so an index of -1 has no cell's key."""
     key = index[..., 0]
     for digit in index[..., 1:].unbind(-1):
         key = torch.add(digit, key, alpha=base)  # base key + digit, in one operation
@@ -427,31 +427,27 @@ class Octree(nn.Module):
         o---o---o
 
     So the features of a level fade to 0 at the border of what it refines, and of the cube; they are
-    continuous. Where a level has no cell, its features are 0. `cells[n]` is (level, i, j, k) of
-    cell n, `child[n]` the row of its first child; `corner[n]` holds the rows of its eight features.
-    `corner_key` names the corner of each feature, so that features survive a rebuild."""
+    continuous. Where a level has no cell, its features are 0."""
     def __init__(self, half, levels, channels=4, root=ROOT):
         super().__init__()
         self.half = half
         self.levels = levels
         self.width = levels * channels  # LC
         self.root = root
-        resolution = root * 2.0 ** torch.arange(levels)
-        self.resolution = nn.Buffer(resolution, persistent=False)  # (L,) cells along an axis
+        self.resolution = nn.Buffer(root * 2.0 ** torch.arange(levels), persistent=False)  # (L,)
         self.features = torch.zeros(0, channels)  # (V,C), none yet; build makes it a parameter
         self.corner_key = nn.Buffer(torch.arange(0), persistent=False)
         self.build(torch.arange(0))  # no cell is split
 
     @property
     def side(self):
-        """(L,) side of a cell, scene units."""
+        """(L,) side of a cell, scene units. resolution: (L,) cells along an axis."""
         return 2 * self.half / self.resolution
 
     def split(self, cells, reach=0):
         """Splits cells (N,4), and those of their neighbours that differ along at most `reach` axes:
-        1 means the six that share a face, 3 all 26. Cells of the last level are not split, nor
-        neighbours that do not exist (an index of -1 has no cell's key). Returns what build does.
-        The field keeps its values, because new features are zero."""
+        1 means the six that share a face, 3 all 26. Cells of the last level are not split. The
+        field keeps its values, because new features are zero. Returns what build does."""
         offsets = grid_index(3, cells.device) - 1  # (27,3)
         offsets = offsets[offsets.abs().sum(1) <= reach]
         cells = (cells[:, None] + F.pad(offsets, (1, 0))).flatten(0, 1)
@@ -459,33 +455,23 @@ class Octree(nn.Module):
         key = key[torch.isin(key, pack_index(self.cells))]  # a neighbour may not exist
         return self.build(torch.cat([self.split_keys, key]).unique())
 
-    def make_tree(self, split_keys):
-        """Cells (N,4), level after level, and the row of each cell's first child (N,), 0 if it has
-        none. The eight children of a cell are neighbours in the list, in the order of octants."""
+    def build(self, split_keys):
+        """Makes cells and corners, given the keys of all cells that are split. Corners that were
+        there before keep their features, new ones have zeros. Returns which rows (V,) of features
+        are old; they keep their order."""
         octants = grid_index(2, split_keys.device)  # (8,3)
         index = grid_index(self.root, split_keys.device)  # (.,3) cells of a level
         cells = []
-        is_split = []
         for level in range(self.levels):
             cells.append(F.pad(index, (1, 0), value=level))  # (.,4) level, i, j, k
-            is_split.append(torch.isin(pack_index(cells[level]), split_keys))  # (.,)
-            parents = index[is_split[level]]
-            index = (2 * parents[:, None] + octants).flatten(0, 1)
+            parents = index[torch.isin(pack_index(cells[level]), split_keys)]
+            index = (2 * parents[:, None] + octants).flatten(0, 1)  # by parent, then octant
         cells = torch.cat(cells)
-        is_split = torch.cat(is_split)  # (N,)
-        # Level 0 fills the first root^3 rows. Children follow in the order of their parents: split
-        # cell number n, counted from 0, has the eight rows from root^3 + 8 n on.
-        first_child = self.root**3 + 8 * (is_split.cumsum(0) - 1)  # (N,)
-        return cells, first_child * is_split
-
-    def build(self, split_keys):
-        """Makes cells and corners, given the keys of all cells that are split. Rows of corners that
-        were there before keep their features, new ones are zero. Returns which rows (V,) are old;
-        they keep their order."""
-        cells, child = self.make_tree(split_keys)
-        octants = grid_index(2, split_keys.device)  # (8,3)
+        is_split = torch.isin(pack_index(cells), split_keys)  # (N,)
+        # level 0 has root^3 rows; children of split cell n (from 0) begin at row root^3 + 8 n
+        child = (self.root**3 + 8 * (is_split.cumsum(0) - 1)).int() * is_split  # (N,)
         # a corner is its cell's index plus an octant; the key of a sum is the sum of the keys
-        corners = pack_index(cells)[:, None] + pack_index(F.pad(octants, (1, 0)))  # (N,8)
+        corners = pack_index(cells)[:, None] + pack_index(octants)  # (N,8)
         key, corner, cells_around = corners.unique(return_inverse=True, return_counts=True)  # (.,)
         has_feature = cells_around == 8
         # rows are counted over corners with a feature; a hanging one has any row, with weight 0
@@ -498,8 +484,8 @@ class Octree(nn.Module):
         self.corner_key = nn.Buffer(key, persistent=False)  # (V,) sorted, the corner of each row
         self.features = nn.Parameter(carry_over_rows(self.features, is_old))
         self.cells = nn.Buffer(cells, persistent=False)  # (N,4) level, i, j, k
-        self.child = nn.Buffer(child.int(), persistent=False)  # (N,) 0: none
-        self.corner = nn.Buffer(row[corner].int(), persistent=False)  # (N,8) rows
+        self.child = nn.Buffer(child, persistent=False)  # (N,) row of the first child, 0: none
+        self.corner = nn.Buffer(row[corner].int(), persistent=False)  # (N,8) rows of features
         self.is_hanging = nn.Buffer(~has_feature[corner], persistent=False)  # (N,8)
         # (N,3) sums over rays that hit a cell: of errors, of pixel sizes there, their number
         self.cell_error = nn.Buffer(self.features.new_zeros(len(cells), 3))
@@ -570,8 +556,7 @@ def cells_to_split(octree):
     children, since the last refinement, as build sets them to 0. [D7]"""
     level = octree.cells[:, 0]  # (N,)
     error_sum, pixel_sum, count = octree.cell_error.T  # (N,) over rays
-    # the mean size of a pixel, pixel_sum / count, is less than a child's side
-    is_coarse = pixel_sum < count * octree.side[level] / 2
+    is_coarse = pixel_sum < count * octree.side[level] / 2  # the mean pixel is below a child's side
     can_split = is_coarse & (level < octree.levels - 1)
     error, order = (error_sum * can_split).sort(descending=True)
     error_before = error.cumsum(0) - error  # (N,) in worse cells
