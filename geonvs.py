@@ -582,30 +582,25 @@ def has_bfloat16(device_type):
 def mixed_precision(network, x):
     """network(x), computed in bfloat16 where that pays, returned as float32. Not for distances:
     finite differences need float32."""
-    device_type = x.device.type
-    if not has_bfloat16(device_type):
+    if not has_bfloat16(x.device.type):
         return network(x)
-    with torch.autocast(device_type, torch.bfloat16):
+    with torch.autocast(x.device.type, torch.bfloat16):
         return network(x).float()
 
 
 def mlp(inputs, hidden, outputs):
     """A network with one hidden layer."""
-    return nn.Sequential(
-        nn.Linear(inputs, hidden),
-        nn.ReLU(),
-        nn.Linear(hidden, outputs))
+    return nn.Sequential(nn.Linear(inputs, hidden), nn.ReLU(), nn.Linear(hidden, outputs))
 
 
 def colors_of(network, geo, per_ray):
     """Colours (R,S,3) that a network reads from geometry (R,S,G) and what is the same for all
     samples of a ray (R,.)."""
     per_ray = per_ray[:, None].expand(-1, geo.shape[1], -1)  # (R,S,.)
-    inputs = torch.cat([geo, per_ray], 2)
-    return mixed_precision(network, inputs).sigmoid()
+    return mixed_precision(network, torch.cat([geo, per_ray], 2)).sigmoid()
 
 
-# a tetrahedron's centre and corners; the corners are 3^0.5 away from it
+# a tetrahedron's centre and corners, which are 3^0.5 away; taps are scaled to length 1
 TETRAHEDRON = ((0, 0, 0), (1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1))
 
 
@@ -631,18 +626,15 @@ def off_surface_loss(sdf, margin):
 
 
 class SDFField(nn.Module):
-    """s(x) and the inputs of the colour network: a geometry feature beside the octree's features.
-    One hidden layer over xyz and features; G = GEOMETRY_FEATURES + L C. The network predicts an
-    offset to the SDF of a small sphere. In float32 on every device."""
+    """s(x), the SDF of a small sphere plus an offset by a network of xyz and the octree's features;
+    and G = GEOMETRY_FEATURES + L C inputs of the colour network. In float32 on every device."""
     def __init__(self, octree, hidden):
         super().__init__()
         self.octree = octree
         self.network = mlp(3 + octree.width, hidden, 1 + GEOMETRY_FEATURES)
-        last = self.network[2]
-        nn.init.normal_(last.weight[0], std=0.01)  # the offset starts near 0
-        nn.init.zeros_(last.bias)
-        taps = torch.tensor(TETRAHEDRON) / 3**0.5  # (5,3), of length 1
-        self.taps = nn.Buffer(taps, persistent=False)
+        nn.init.normal_(self.network[-1].weight[0], std=0.01)  # the offset starts near 0
+        nn.init.zeros_(self.network[-1].bias)
+        self.taps = nn.Buffer(torch.tensor(TETRAHEDRON) / 3**0.5, persistent=False)  # (5,3)
 
     def forward(self, x):
         """sdf (...) and geometry (...,G) at x (...,3)."""
@@ -676,8 +668,7 @@ class LipschitzLinear(nn.Linear):
 
 def lipschitz_loss(network):
     """L_lps: the network's Lipschitz bound, the product of its layers' (Liu et al. 2022)."""
-    return math.prod(
-        layer.bound() for layer in network if isinstance(layer, LipschitzLinear))
+    return math.prod(layer.bound() for layer in network if isinstance(layer, LipschitzLinear))
 
 
 # ---- 5 From SDF to colour: alpha, compositing, samples, background -------------------------------
