@@ -688,10 +688,9 @@ def neus_alpha(sdf, zeta):
 
 def paper_alpha(sdf, zeta):
     """Eq. 1 as printed: sigmoid(zeta s_i + beta_i) - sigmoid(zeta s_{i+1} + beta_i), here not
-    negative. beta_i, half of the slope times the length of the interval, is half of the change of
-    s. Without NeuS's division the opacities of a crossing sum to about 1. With many samples the
-    product of 1 - alpha tends to exp(-1), so 37 % of the light passes."""
-    beta = sdf.diff() / 2  # (R,S)
+    negative. Without NeuS's division the opacities of a crossing sum to about 1. With many samples
+    the product of 1 - alpha tends to exp(-1), so 37 % of the light passes."""
+    beta = sdf.diff() / 2  # (R,S) half of the slope times the length of the interval
     before = torch.sigmoid(zeta * sdf[:, :-1] + beta)
     after = torch.sigmoid(zeta * sdf[:, 1:] + beta)
     return (before - after).clamp_min(0)
@@ -732,8 +731,7 @@ def importance_samples(probes, alpha, u):
     weight = composite(alpha)
     uniform_weight = UNIFORM_SHARE * weight.mean(1, keepdim=True)
     weight = weight + uniform_weight + 1e-5  # an empty ray has uniform samples
-    inner = inverse_cdf(probes, weight, u)
-    return torch.cat([probes[:, :1], inner, probes[:, -1:]], 1)
+    return torch.cat([probes[:, :1], inverse_cdf(probes, weight, u), probes[:, -1:]], 1)
 
 
 class SDFCache(nn.Module):
@@ -751,11 +749,18 @@ class SDFCache(nn.Module):
         self.points = nn.Buffer(voxels[inside], persistent=False)  # (P,3)
 
     def refresh(self, signed_distance):
-        """Evaluates signed_distance, (P,3) to (P,), again at all voxels in the sphere."""
-        s = self.volume[0, 0].flatten()  # (n^3,) a view of the volume
-        s[self.inside] = in_chunks(signed_distance, self.points)
-        s = s.view(self.n, self.n, self.n)
-        self.volume[0] = torch.stack([s, *central_differences(s)])
+        """Evaluates signed_distance, (P,3) to (P,), again at all voxels in the sphere, then E_grad
+        and E_curv = |lap s| h by central differences, h being the side of a voxel. At an edge the
+        slope changes by about 1 within a step h, so |lap s| is about 1 / h, whereas |lap s| h does
+        not depend on the grid. [D2]"""
+        h = self.side
+        s = self.volume[0, 0]  # (n,n,n) a view of the volume
+        s.view(-1)[self.inside] = in_chunks(signed_distance, self.points)
+        slopes = torch.gradient(s, spacing=h)  # along x, y, z
+        lap = sum(torch.gradient(slope, spacing=h, dim=i)[0] for i, slope in enumerate(slopes))
+        grad = torch.stack(slopes, -1).flatten(0, 2)  # (n^3,3)
+        self.volume[0, 1] = eikonal(grad).view_as(s)
+        self.volume[0, 2] = lap.abs() * h
 
     def lookup(self, x, channels):
         """Values (.,R,J) of some channels at x (R,J,3), trilinear."""
@@ -772,17 +777,6 @@ class SDFCache(nn.Module):
         return self.lookup(x, slice(1, 3)).mean(2)
 
 
-def central_differences(s):
-    """E_grad and E_curv (n,n,n) of a field s (n,n,n) over [-1, 1]^3. E_curv = |lap s| h, h being
-    the side of a voxel: at an edge the slope changes by about 1 within a step h, so |lap s| is
-    about 1 / h, whereas |lap s| h does not depend on the grid. [D2]"""
-    h = 2 / (len(s) - 1)
-    slopes = torch.gradient(s, spacing=h)  # along x, y, z
-    lap = sum(torch.gradient(slope, spacing=h, dim=i)[0] for i, slope in enumerate(slopes))
-    grad = torch.stack(slopes, -1).flatten(0, 2)  # (n^3,3)
-    return eikonal(grad).view_as(s), lap.abs() * h
-
-
 def contract(x):
     """Squeezes |x| > 1 into the ball of radius 2 (mip-NeRF 360 Eq. 10); identity inside."""
     inverse = 1 / x.norm(dim=-1, keepdim=True).clamp_min(1)  # (...,1)
@@ -791,59 +785,51 @@ def contract(x):
 
 class Background(nn.Module):
     """A small NeRF before and beyond the sphere, on an octree over contracted space."""
-    def __init__(self, points, hidden, per_ray_dim, levels, samples):
+    def __init__(self, points, cfg, A, levels):
         super().__init__()
-        self.samples = samples
+        self.samples = cfg.bg_samples
+        levels = min(levels, 4)  # at most 256 cells across
         self.octree = Octree(2.0, levels, root=32)  # cells of 1/8
         seed_octree(self.octree, contract(points), dense=levels - 3)  # points (P,3)
-        self.density = mlp(3 + self.octree.width, hidden, 1 + GEOMETRY_FEATURES)
-        self.color = mlp(GEOMETRY_FEATURES + per_ray_dim, hidden, 3)
+        self.density = mlp(3 + self.octree.width, cfg.hidden, 1 + GEOMETRY_FEATURES)
+        self.color = mlp(GEOMETRY_FEATURES + 3 + A, cfg.hidden, 3)
 
-    def sample(self, rays, t0, t1, gen=None):
-        """Distances (R,K) of the samples around the sphere, which rays enter at t0 (R,1) and leave
-        at t1; lengths (R,K-1) of the intervals that begin there; how many samples lie before the
-        sphere, between near and t0. The others lie at t1 + u / (1 - u), u in 0..1, to reach far."""
-        n = self.samples // 6  # little stands before a landmark
+    def forward(self, rays, t0, t1, code, gen=None):
+        """What rays see around the sphere, which they enter at t0 (R,1) and leave at t1, under
+        codes (R,A). Returns the colour (R,3) of what lies before the sphere and the share (R,1) of
+        light that passes it; the colour (R,3) beyond the sphere, already dimmed by that share; the
+        mean position (R,3) there, in contracted space, without gradient."""
+        n = self.samples // 6  # samples before the sphere; little stands before a landmark
         near = rays.near.lerp(t0, stratified(rays, n, gen))  # (R,n)
         u = stratified(rays, self.samples - n, gen)  # (R,K-n)
-        far = u / (1 - u).clamp_min(1e-3)  # (R,K-n) at most 1,000 radii
+        far = u / (1 - u).clamp_min(1e-3)  # (R,K-n) beyond t1, dense near it, at most 1,000 radii
         near_length = torch.cat([near, t0], 1).diff()  # (R,n) the last one ends at the sphere
         length = torch.cat([near_length, far.diff()], 1)  # (R,K-1)
-        return torch.cat([near, t1 + far], 1), length, n
-
-    def forward(self, rays, t0, t1, per_ray, gen=None):
-        """What rays see around the sphere, between t0 and t1 (R,1). per_ray: (R,3+A) direction and
-        code. Returns the colour (R,3) of what lies before the sphere and the share (R,1) of light
-        that passes it; the colour (R,3) beyond the sphere, already dimmed by that share; the mean
-        position (R,3) there, in contracted space, without gradient."""
-        t, length, n = self.sample(rays, t0, t1, gen)
-        x = contract(rays.at(t))  # (R,K,3)
+        x = contract(rays.at(torch.cat([near, t1 + far], 1)))  # (R,K,3)
         inputs = torch.cat([x, self.octree(x)], 2)  # (R,K,3+LC)
         out = mixed_precision(self.density, inputs)  # (R,K,1+GEOMETRY_FEATURES)
         sigma, geo = out.split([1, GEOMETRY_FEATURES], 2)
-        sigma = F.softplus(sigma[..., 0] - 1)  # (R,K) starts at 0.31
+        sigma = F.softplus(sigma.squeeze(2) - 1)  # (R,K) starts at 0.31
         alpha = 1 - torch.exp(-sigma[:, :-1] * length)  # (R,K-1)
         w = composite(F.pad(alpha, (0, 1), value=1.0))  # (R,K) the last sample is opaque
-        colors = w[..., None] * colors_of(self.color, geo, per_ray)  # (R,K,3)
-        near_color = colors[:, :n].sum(1)  # (R,3)
-        far_color = colors[:, n:].sum(1)  # (R,3)
-        near_transmittance = 1 - w[:, :n].sum(1, keepdim=True)  # (R,1)
+        colors = colors_of(self.color, geo, torch.cat([rays.d, code], 1))  # (R,K,3)
+        colors = w[..., None] * colors
+        near_color, far_color = [c.sum(1) for c in colors.split([n, self.samples - n], 1)]  # (R,3)
+        near_trans = 1 - w[:, :n].sum(1, keepdim=True)  # (R,1)
         far_w = F.normalize(w[:, n:].detach(), p=1, dim=1)
         place = torch.einsum("rk,rkc->rc", far_w, x[:, n:])
-        return near_color, near_transmittance, far_color, place
+        return near_color, near_trans, far_color, place
 
 
 def surface_depth(t, sdf, w):
     """Distance (R,) to the surface on rays with samples at t (R,S+1), SDF (R,S+1) and weights w
-    (R,S) of the intervals between them. Each interval extends s as a line to a zero; the result is
-    the weighted mean of these zeros. An interval that leads from outside to inside holds its zero.
-    Any other extrapolates, which is exact for a plane alone, and counts a hundredth: it decides on
-    rays that only graze a surface. Where s rises, w is 0. A ray without weight gets the last
-    sample."""
+    (R,S) of the intervals between them: the weighted mean of the zeros to which intervals extend s
+    as a line. An interval that leads from outside to inside holds its zero. Any other extrapolates,
+    which is exact for a plane alone, and counts a hundredth: it decides on rays that only graze a
+    surface. Where s rises, w is 0. A ray without weight gets the last sample."""
     start, end = sdf[:, :-1], sdf[:, 1:]
     fraction = start / (start - end).clamp_min(1e-6)  # (R,S) of the interval, up to the zero
-    zero = torch.lerp(t[:, :-1], t[:, 1:], fraction)
-    zero = zero.clamp(t[:, :1], t[:, -1:])
+    zero = t[:, :-1].lerp(t[:, 1:], fraction).clamp(t[:, :1], t[:, -1:])
     vote = torch.where((start > 0) & (end <= 0), w, 0.01 * w)  # (R,S)
     return ((vote * zero).sum(1) + 1e-8 * t[:, -1]) / (vote.sum(1) + 1e-8)
 
@@ -886,11 +872,11 @@ def complexity(e_grad, e_curv):
 
 
 def edge_indicator(ray_complexity, opacity):
-    """Phi (R,), Eq. 4: opacity times sigmoid((x - mean) / deviation), x being the logarithm of the
-    complexity. The paper calibrates its sigmoid, but does not say how. Here mean and deviation are
-    those of x over the step's rays, weighted by opacity, so that Phi tells edges from flat walls at
-    any scale. The factor opacity (R,) makes Phi 0 on rays through air, which have no edge. The
-    caller sets it to 0 where a user's mask excludes the pixel, too. [D2]"""
+    """Phi (R,), Eq. 4: opacity sigmoid((x - mean) / deviation), x being the log of the complexity.
+    The paper calibrates its sigmoid, but does not say how. Here mean and deviation are those of x
+    over the step's rays, weighted by opacity, so that Phi tells edges from flat walls at any scale.
+    Phi is 0 where opacity (R,) is: on rays through air, which have no edge, and where the caller
+    sets it to 0, as a user's mask excludes the pixel. [D2]"""
     weight = opacity / opacity.sum().clamp_min(1e-6)  # (R,)
     x = (ray_complexity + 1e-3).log()
     mean = (weight * x).sum()
@@ -916,11 +902,9 @@ def mask_loss(logit, excess):
     exceeds its threshold (excess > 0), else 0; its weight is |excess|. Without L_GPL the best M of
     a ray is its label. The simpler loss (1 - M) error + M threshold has the same minimum, but no
     gradient where the sigmoid saturates. With L_GPL an outlier minimises
-    -excess log M + lam_gpl M Phi (lam_mask is 1). The derivative is 0 at excess / (lam_gpl Phi):
-    that is the best M, or 1 if it is more. So an edge with Phi = 1 is masked fully only if excess
-    is at least lam_gpl. [D3]"""
-    is_transient = (excess > 0).float()
-    return F.binary_cross_entropy_with_logits(logit, is_transient, excess.abs())
+    -excess log M + lam_gpl M Phi (lam_mask is 1). Its best M is excess / (lam_gpl Phi), at most 1:
+    an edge with Phi = 1 is masked fully only if excess is at least lam_gpl. [D3]"""
+    return F.binary_cross_entropy_with_logits(logit, (excess > 0).float(), excess.abs())
 
 
 def paper_mask_loss(mask, error):
@@ -932,11 +916,10 @@ def paper_mask_loss(mask, error):
 
 
 def reject_outliers(mask, is_outlier, done):
-    """M (R,), set to 1 where a ray is rejected. A ray is rejected if its error exceeds its
-    threshold (is_outlier) and M exceeds a bar. The bar starts at 0, so at first every outlier is
-    rejected. That may be static structure which is not learnt yet, but not for long: structure errs
-    in all photos, and this raises the threshold (UsualErrors, below). The bar reaches 1 at
-    REJECTION of training; from then on M alone decides. [D3]"""
+    """M (R,), set to 1 for a rejected ray: its error exceeds the threshold (is_outlier), M a bar.
+    The bar starts at 0, so at first every outlier is rejected. That may be static structure which
+    is not learnt yet, but not for long: structure errs in all photos, and this raises the threshold
+    (UsualErrors, below). The bar reaches 1 at REJECTION of training; then M alone decides. [D3]"""
     bar = (done / REJECTION) ** 2  # squared: it rises late
     return torch.where(is_outlier & (mask > bar), 1.0, mask)
 
@@ -951,7 +934,7 @@ class UsualErrors(nn.Module):
 
     def cell(self, place):
         """Index (R,) into the table of places (R,3)."""
-        index = ((place * 0.25 + 0.5) * PLACE_CELLS).long()
+        index = ((place + 2) * (PLACE_CELLS / 4)).long()  # the space is 4 wide
         return pack_index(index.clamp(0, PLACE_CELLS - 1), base=PLACE_CELLS)
 
     def threshold(self, place):
@@ -964,8 +947,7 @@ class UsualErrors(nn.Module):
         down by 1 - PLACE_QUANTILE: they balance at the quantile (the pinball loss's gradient). A
         step multiplies the quantile by exp(QUANTILE_RATE times the mean push)."""
         cell = self.cell(place)
-        is_below = error < self.quantile[cell]
-        push = torch.where(is_below, PLACE_QUANTILE - 1, PLACE_QUANTILE)
+        push = torch.where(error < self.quantile[cell], PLACE_QUANTILE - 1, PLACE_QUANTILE)
         count = len(self.quantile)
         mean = push.new_zeros(count + 1)  # the last one is of rays that do not count
         cell = torch.where(is_chosen, cell, count)
@@ -994,8 +976,7 @@ class ContextBlock(nn.Module):
 
     def forward(self, x):
         y = self.reduce(x)  # (B,n,h/2,w/2)
-        y = torch.cat([self.local(y), self.around(y)], 1)
-        y = F.relu(self.norm(y))  # (B,2n,h/2,w/2)
+        y = self.norm(torch.cat([self.local(y), self.around(y)], 1)).relu()  # (B,2n,h/2,w/2)
         gate = self.gate(y.mean((2, 3))).sigmoid()  # (B,2n)
         return y * gate[..., None, None]
 
@@ -1016,10 +997,8 @@ class TransientMask(nn.Module):
             nn.Sequential(conv(3, 16, stride=2), conv(16, 16, stride=1)),
             ContextBlock(16, dilation=2),
             ContextBlock(32, dilation=4))
-        self.heads = nn.ModuleList([
-            nn.Conv2d(16, 1, 1),
-            nn.Conv2d(32, 1, 1, bias=False),  # as logits are summed, one bias is enough
-            nn.Conv2d(64, 1, 1, bias=False)])
+        # as logits are summed, one bias is enough
+        self.heads = nn.ModuleList([nn.Conv2d(n, 1, 1, bias=n == 16) for n in (16, 32, 64)])
         nn.init.constant_(self.heads[0].bias, -2.5)  # starts with 8 % masked, not with half
         self.thumbs = nn.Buffer(thumbs, persistent=False)  # (I,3,2m,2m)
 
@@ -1048,14 +1027,11 @@ def needed_parts(cfg, raw):
     def is_on(switch, is_needed):
         return bool(is_needed) if switch == "auto" else switch == "on"
 
-    levels = cfg.levels
-    if levels == 0:
-        pixels = 2 / raw["footprint"]  # across the sphere; footprint: a pixel's size there
-        levels = int(np.clip(1 + np.log2(pixels / ROOT), 2, 8))  # no cell smaller than a pixel
+    pixels = 2 / raw["footprint"]  # across the sphere; footprint: a pixel's size there
+    levels = int(np.clip(1 + np.log2(pixels / ROOT), 2, 8))  # no cell smaller than a pixel
     has_codes = is_on(cfg.appearance, raw["exposure_spread"] > 0.01)
-    has_no_color = np.isnan(raw["bg_color"]).any()  # nan: the background has no one colour
-    has_background = is_on(cfg.background, has_no_color)
-    return levels, cfg.appearance_dim if has_codes else 0, has_background
+    has_background = is_on(cfg.background, np.isnan(raw["bg_color"]).any())  # nan: no one colour
+    return cfg.levels or levels, cfg.appearance_dim if has_codes else 0, has_background
 
 
 def objective(loss, cfg):
@@ -1106,9 +1082,7 @@ class GeoNVS(nn.Module):
         bg_color = torch.tensor(scene.raw["bg_color"].tolist()).nan_to_num(0.5)
         self.bg_color = nn.Buffer(bg_color, persistent=False)
         if has_background:
-            bg_levels = min(levels, 4)  # at most 256 cells across
-            self.background = Background(
-                scene.points[~is_inside], cfg.hidden, 3 + A, bg_levels, cfg.bg_samples)
+            self.background = Background(scene.points[~is_inside], cfg, A, levels)
             self.octrees.append(self.background.octree)
         self.deviation = nn.Parameter(torch.tensor(math.log(START_ZETA) / 10))
         self.mask = TransientMask(scene.thumbs) if self.has_mask else None
@@ -1135,10 +1109,10 @@ class GeoNVS(nn.Module):
             least = LEAST_ZETA * min(done / ZETA_RISE, 1) + 1e-6  # 0 has no logarithm
             self.deviation.data.clamp_min_(math.log(least) / 10)
 
-    def alpha(self, sdf, max_zeta=math.inf):
+    def alpha(self, sdf, zeta):
         """Opacity (R,S) of the intervals between samples with SDF (R,S+1). Eq. 1"""
         form = paper_alpha if self.cfg.printed("alpha") else neus_alpha
-        return form(sdf, self.zeta().clamp_max(max_zeta))
+        return form(sdf, zeta)
 
     def signed_distance(self, x):
         """s (P,) at x (P,3)."""
@@ -1151,8 +1125,8 @@ class GeoNVS(nn.Module):
         surface is taken to be at least that wide, however large zeta is."""
         even = torch.linspace(0, 1, PROBES + 1, device=t0.device)
         probes = t0.lerp(t1, even)  # (R,PROBES+1)
-        sdf = self.cache.sdf(rays.at(probes))  # (R,PROBES+1)
-        alpha = self.alpha(sdf, max_zeta=self.cache.n)  # 1 / n is half a voxel
+        zeta = self.zeta().clamp_max(self.cache.n)  # 1 / n is half a voxel
+        alpha = self.alpha(self.cache.sdf(rays.at(probes)), zeta)  # (R,PROBES)
         return importance_samples(probes, alpha, stratified(rays, self.cfg.samples - 1, gen))
 
     def trace(self, rays, code, gen=None):
@@ -1162,7 +1136,7 @@ class GeoNVS(nn.Module):
         t = self.sample(rays, t0, t1, gen)  # (R,S+1)
         x = rays.at(t)  # (R,S+1,3)
         sdf, geo = self.sdf(x)  # (R,S+1), (R,S+1,G)
-        interval_w = composite(self.alpha(sdf))  # (R,S)
+        interval_w = composite(self.alpha(sdf, self.zeta()))  # (R,S)
         opacity = interval_w.sum(1)  # (R,)
         depth = surface_depth(t, sdf.detach(), interval_w.detach())
         point = rays.at(depth[:, None])[:, 0]  # (R,3)
@@ -1174,10 +1148,8 @@ class GeoNVS(nn.Module):
         far_color = self.bg_color  # (3,)
         far_place = 2 * rays.d  # (R,3) infinity
         if self.background:
-            per_ray = torch.cat([rays.d, code], 1)  # (R,3+A)
-            near_color, near_transmittance, far_color, far_place = self.background(
-                rays, t0, t1, per_ray, gen)
-            w = near_transmittance * w
+            near_color, near_trans, far_color, far_place = self.background(rays, t0, t1, code, gen)
+            w = near_trans * w
         around = near_color + (1 - opacity[:, None]) * far_color  # (R,3)
         place = torch.where(opacity[:, None] > 0.5, point, far_place)
         return Hits(x, geo, w, opacity, depth, point, around, place)
@@ -1193,12 +1165,13 @@ class GeoNVS(nn.Module):
         """The objective of rays that come photo by photo, equally many of each of photos (B,);
         done: share of training, 0..1. Returns the total, and a dictionary for the log. Side effect:
         update_statistics."""
-        cfg = self.cfg
         R = len(rays.o)
         code = self.appearance(photos).repeat_interleave(R // len(photos), 0)  # (R,A)
         hits = self.trace(rays, code, gen)
         n = math.ceil(R / 4)  # SfM points, and as many in air
-        sfm, air = self.known_points(n, gen)  # (n,3), (n,3)
+        sfm = self.sfm[random_index(gen, len(self.sfm), n)]  # (n,3) where s is 0 [D5]
+        start, end = self.air[random_index(gen, len(self.air), n)].unbind(1)  # (n,3)
+        air = start.lerp(end, uniform(gen, n, 1))  # (n,3) where s is positive [D5]
         points = torch.cat([hits.point, sfm, air])  # (R+2n,3), looked up at once [D6]
         s, grad, lap = self.sdf.derivatives(points, self.eps)  # (R+2n,), (R+2n,3), (R+2n,)
         opacity = hits.opacity.detach()
@@ -1224,17 +1197,8 @@ class GeoNVS(nn.Module):
             off=pull * off_surface_loss(s_air, margin),  # [D5]
             sfm=pull * s_sfm.abs().mean())  # [D5]
         self.update_statistics(rays, hits, error)
-        log = loss | dict(
-            mse=residual.square().mean(),
-            left_out=left_out.mean())
-        return objective(loss, cfg), log
-
-    def known_points(self, n, gen):
-        """n random SfM points, where s is 0, and n random points in air, where s is positive: (n,3)
-        each. [D5]"""
-        sfm = self.sfm[random_index(gen, len(self.sfm), n)]  # (n,3)
-        start, end = self.air[random_index(gen, len(self.air), n)].unbind(1)  # (n,3)
-        return sfm, start.lerp(end, uniform(gen, n, 1))
+        log = loss | dict(mse=residual.square().mean(), left_out=left_out.mean())
+        return objective(loss, self.cfg), log
 
     def phi(self, rays, hits):
         """Phi (R,) of rays with hits, 0 where a user's mask excludes the pixel. Eq. 4"""
@@ -1243,8 +1207,7 @@ class GeoNVS(nn.Module):
         if self.cfg.printed("phi"):
             is_inside = hits.x[:, 0].norm(dim=1) < 1.001  # not if a ray misses the sphere
             e_curv = e_curv / self.cache.side  # as printed: |lap s| without h
-            ray_complexity = complexity(e_grad, e_curv) * is_inside
-            return paper_phi(ray_complexity) * is_counted
+            return paper_phi(complexity(e_grad, e_curv) * is_inside) * is_counted
         return edge_indicator(complexity(e_grad, e_curv), hits.opacity.detach() * is_counted)
 
     def transients(self, rays, photos, place, phi, error, done):
@@ -1256,15 +1219,14 @@ class GeoNVS(nn.Module):
         with torch.set_grad_enabled(done < MASK_TRAINING):
             logit = sample_logits(self.mask.logits(photos), rays.uv)  # (R,)
         M = logit.sigmoid()
-        is_counted = ~rays.is_masked
         # SfM pixels count as if they had no error: they train M = 0 [D5]
         judged = error.masked_fill(rays.has_sfm, 0)
         if self.cfg.printed("reg"):
-            reg = paper_mask_loss(M * is_counted, judged)  # it trains M in L_rgb's place
+            reg = paper_mask_loss(M * ~rays.is_masked, judged)  # it trains M in L_rgb's place
             left_out = M.detach()
         else:
             excess = judged - self.usual_errors.threshold(place)
-            reg = mask_loss(logit, excess * is_counted)
+            reg = mask_loss(logit, excess * ~rays.is_masked)
             left_out = reject_outliers(M.detach(), excess > 0, done)
         return left_out.masked_fill(rays.is_masked, 1), reg, gpl_loss(M, phi)
 
@@ -1294,17 +1256,16 @@ class GeoNVS(nn.Module):
 
     def groups(self):
         """Optimiser groups with their learning rates: networks, grids, codes, mask."""
-        cfg = self.cfg
         grids = [octree.features for octree in self.octrees]
         codes = [self.appearance.weight]
         mask = list(self.mask.parameters()) if self.has_mask else []
         special = set(grids + codes + mask)
         networks = [p for p in self.parameters() if p not in special]
         return [
-            dict(params=networks, base_lr=cfg.lr_net),
-            dict(params=grids, base_lr=cfg.lr_grid),
-            dict(params=codes, base_lr=cfg.lr_code),
-            dict(params=mask, base_lr=cfg.lr_mask)]
+            dict(params=networks, base_lr=self.cfg.lr_net),
+            dict(params=grids, base_lr=self.cfg.lr_grid),
+            dict(params=codes, base_lr=self.cfg.lr_code),
+            dict(params=mask, base_lr=self.cfg.lr_mask)]
 
     def refine(self, optimizer, processes=ALONE):
         """Splits cells where colours err, and the neighbours that share a face with them, as the
@@ -1319,8 +1280,7 @@ class GeoNVS(nn.Module):
         for name in ("exp_avg", "exp_avg_sq"):
             state[name] = carry_over_rows(state[name], is_old)
         optimizer.state[octree.features] = state
-        _, grids, _, _ = optimizer.param_groups
-        grids["params"] = [tree.features for tree in self.octrees]
+        optimizer.param_groups[1]["params"] = [tree.features for tree in self.octrees]  # the grids
 
     def codes(self):
         """Appearance codes (I,A) of all photos."""

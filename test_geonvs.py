@@ -2060,8 +2060,8 @@ def test_a_step_is_finite_whatever_the_sdf(warm, distance, zeta):
             assert grad.isfinite().all()
 
 
-ALIKE = dict(exposure_spread=0.009, bg_color=np.array([0.2, 0.4, 0.6]))
-VARIED = dict(exposure_spread=0.011, bg_color=np.array([0.2, 0.4, math.nan]))
+ALIKE = dict(footprint=0.02, exposure_spread=0.009, bg_color=np.array([0.2, 0.4, 0.6]))
+VARIED = dict(footprint=0.02, exposure_spread=0.011, bg_color=np.array([0.2, 0.4, math.nan]))
 
 
 @cases(
@@ -3519,7 +3519,7 @@ class Density(geonvs.GeoNVS):
         self.length = t.diff()  # (R,S)
         return t
 
-    def alpha(self, sdf, max_zeta=math.inf):
+    def alpha(self, sdf, zeta=None):
         mean = (sdf[:, :-1] + sdf[:, 1:]) / 2  # (R,S)
         sigma = torch.exp(-10 * mean.clamp(-2, 2))
         return 1 - torch.exp(-sigma * self.length)
