@@ -711,9 +711,8 @@ def inverse_cdf(edges, weight, u):
     cdf = F.pad(cdf / cdf[:, -1:], (1, 0))  # (R,J+1)
     right = torch.searchsorted(cdf, u, right=True).clamp_max(weight.shape[1])  # (R,S) from 1
     left = right - 1
-    below = cdf.gather(1, left)
-    width = cdf.gather(1, right) - below
-    part = (u - below) / width.clamp_min(1e-9)
+    below, above = cdf.gather(1, left), cdf.gather(1, right)
+    part = (u - below) / (above - below).clamp_min(1e-9)
     return edges.gather(1, left).lerp(edges.gather(1, right), part.clamp(0, 1))
 
 
@@ -810,10 +809,10 @@ class Background(nn.Module):
         out = mixed_precision(self.density, inputs)  # (R,K,1+GEOMETRY_FEATURES)
         sigma, geo = out.split([1, GEOMETRY_FEATURES], 2)
         sigma = F.softplus(sigma.squeeze(2) - 1)  # (R,K) starts at 0.31
-        alpha = 1 - torch.exp(-sigma[:, :-1] * length)  # (R,K-1)
+        alpha = 1 - torch.exp(-length * sigma[:, :-1])  # (R,K-1)
         w = composite(F.pad(alpha, (0, 1), value=1.0))  # (R,K) the last sample is opaque
-        colors = colors_of(self.color, geo, torch.cat([rays.d, code], 1))  # (R,K,3)
-        colors = w[..., None] * colors
+        per_ray = torch.cat([rays.d, code], 1)  # (R,3+A)
+        colors = w[..., None] * colors_of(self.color, geo, per_ray)  # (R,K,3)
         near_color, far_color = [c.sum(1) for c in colors.split([n, self.samples - n], 1)]  # (R,3)
         near_trans = 1 - w[:, :n].sum(1, keepdim=True)  # (R,1)
         far_w = F.normalize(w[:, n:].detach(), p=1, dim=1)
@@ -921,7 +920,7 @@ def reject_outliers(mask, is_outlier, done):
     is not learnt yet, but not for long: structure errs in all photos, and this raises the threshold
     (UsualErrors, below). The bar reaches 1 at REJECTION of training; then M alone decides. [D3]"""
     bar = (done / REJECTION) ** 2  # squared: it rises late
-    return torch.where(is_outlier & (mask > bar), 1.0, mask)
+    return mask.masked_fill(is_outlier & (mask > bar), 1)
 
 
 class UsualErrors(nn.Module):
@@ -984,8 +983,7 @@ class ContextBlock(nn.Module):
 def sample_logits(logits, uv):
     """Logits (R,) at uv (R,2) in 0..1 of logits (B,1,h,w); rays come photo by photo, R / B each."""
     grid = (2 * uv - 1).reshape(len(logits), -1, 1, 2)  # (B,R/B,1,2)
-    at = F.grid_sample(logits, grid, padding_mode="border", align_corners=False)
-    return at.flatten()
+    return F.grid_sample(logits, grid, padding_mode="border", align_corners=False).flatten()
 
 
 class TransientMask(nn.Module):
@@ -1005,11 +1003,10 @@ class TransientMask(nn.Module):
     def logits(self, photos):
         """Transient logits (B,1,m,m) of photos (B,)."""
         y = self.thumbs[photos] / 255 - 0.5  # (B,3,2m,2m)
-        size = y.shape[2] // 2
         logits = 0
         for stage, head in zip(self.stages, self.heads):
             y = stage(y)  # (B,16,m,m), (B,32,m/2,m/2), (B,64,m/4,m/4)
-            logits += F.interpolate(head(y), size, mode="bilinear")
+            logits += F.interpolate(head(y), self.thumbs.shape[2] // 2, mode="bilinear")
         return logits
 
 
@@ -1123,8 +1120,7 @@ class GeoNVS(nn.Module):
         """Distances (R,S+1) of the samples between t0 and t1 (R,1), dense where the cache sees a
         surface. The cache knows where s is 0 to about half a voxel. So, to place samples, a
         surface is taken to be at least that wide, however large zeta is."""
-        even = torch.linspace(0, 1, PROBES + 1, device=t0.device)
-        probes = t0.lerp(t1, even)  # (R,PROBES+1)
+        probes = t0.lerp(t1, torch.linspace(0, 1, PROBES + 1, device=t0.device))  # (R,PROBES+1)
         zeta = self.zeta().clamp_max(self.cache.n)  # 1 / n is half a voxel
         alpha = self.alpha(self.cache.sdf(rays.at(probes)), zeta)  # (R,PROBES)
         return importance_samples(probes, alpha, stratified(rays, self.cfg.samples - 1, gen))
@@ -1140,8 +1136,7 @@ class GeoNVS(nn.Module):
         opacity = interval_w.sum(1)  # (R,)
         depth = surface_depth(t, sdf.detach(), interval_w.detach())
         point = rays.at(depth[:, None])[:, 0]  # (R,3)
-        # alpha belongs to intervals, colour to samples: an interval gives half of its weight to
-        # the sample at either end [D1]
+        # alpha belongs to intervals, colour to samples: either end gets half of the weight [D1]
         w = F.avg_pool1d(interval_w, 2, stride=1, padding=1)  # (R,S+1)
 
         near_color = 0  # nothing stands before the sphere
@@ -1162,9 +1157,8 @@ class GeoNVS(nn.Module):
         return torch.einsum("rs,rsc->rc", hits.w, rgb) + hits.around
 
     def losses(self, rays, photos, done, gen):
-        """The objective of rays that come photo by photo, equally many of each of photos (B,);
-        done: share of training, 0..1. Returns the total, and a dictionary for the log. Side effect:
-        update_statistics."""
+        """The objective, and a dictionary for the log, of rays that come photo by photo, equally
+        many of each of photos (B,); done: share of training, 0..1. Calls update_statistics."""
         R = len(rays.o)
         code = self.appearance(photos).repeat_interleave(R // len(photos), 0)  # (R,A)
         hits = self.trace(rays, code, gen)
@@ -1175,7 +1169,7 @@ class GeoNVS(nn.Module):
         points = torch.cat([hits.point, sfm, air])  # (R+2n,3), looked up at once [D6]
         s, grad, lap = self.sdf.derivatives(points, self.eps)  # (R+2n,), (R+2n,3), (R+2n,)
         opacity = hits.opacity.detach()
-        eik_weight = torch.cat([opacity, opacity.new_ones(2 * n)])  # (R+2n,)
+        eik_weight = F.pad(opacity, (0, 2 * n), value=1.0)  # (R+2n,) 1 at SfM points and in air
 
         rgb = self.shade(rays, code, hits, F.normalize(grad[:R]))  # (R,3)
         residual = (rgb - rays.rgb).abs()  # (R,3)
@@ -1202,13 +1196,12 @@ class GeoNVS(nn.Module):
 
     def phi(self, rays, hits):
         """Phi (R,) of rays with hits, 0 where a user's mask excludes the pixel. Eq. 4"""
-        is_counted = ~rays.is_masked
         e_grad, e_curv = self.cache.errors(hits.x)  # (R,)
         if self.cfg.printed("phi"):
             is_inside = hits.x[:, 0].norm(dim=1) < 1.001  # not if a ray misses the sphere
             e_curv = e_curv / self.cache.side  # as printed: |lap s| without h
-            return paper_phi(complexity(e_grad, e_curv) * is_inside) * is_counted
-        return edge_indicator(complexity(e_grad, e_curv), hits.opacity.detach() * is_counted)
+            return paper_phi(complexity(e_grad, e_curv) * is_inside) * ~rays.is_masked
+        return edge_indicator(complexity(e_grad, e_curv), hits.opacity.detach() * ~rays.is_masked)
 
     def transients(self, rays, photos, place, phi, error, done):
         """Section 6 for rays that end at places (R,3), with Phi and errors (R,). Returns left_out
