@@ -822,10 +822,10 @@ class Background(nn.Module):
 
 def surface_depth(t, sdf, w):
     """Distance (R,) to the surface on rays with samples at t (R,S+1), SDF (R,S+1) and weights w
-    (R,S) of the intervals between them: the weighted mean of the zeros to which intervals extend s
-    as a line. An interval that leads from outside to inside holds its zero. Any other extrapolates,
-    which is exact for a plane alone, and counts a hundredth: it decides on rays that only graze a
-    surface. Where s rises, w is 0. A ray without weight gets the last sample."""
+    (R,S) of the intervals between them. Each interval gives a zero of s, taken as a line; the
+    result is their weighted mean. An interval that leads from outside to inside holds its zero. Any
+    other extrapolates, which is exact for a plane alone, and counts a hundredth: it decides on rays
+    that only graze a surface. Where s rises, w is 0. A ray without weight gets the last sample."""
     start, end = sdf[:, :-1], sdf[:, 1:]
     fraction = start / (start - end).clamp_min(1e-6)  # (R,S) of the interval, up to the zero
     zero = t[:, :-1].lerp(t[:, 1:], fraction).clamp(t[:, :1], t[:, -1:])
@@ -915,9 +915,9 @@ def paper_mask_loss(mask, error):
 
 
 def reject_outliers(mask, is_outlier, done):
-    """M (R,), set to 1 for a rejected ray: its error exceeds the threshold (is_outlier), M a bar.
-    The bar starts at 0, so at first every outlier is rejected. That may be static structure which
-    is not learnt yet, but not for long: structure errs in all photos, and this raises the threshold
+    """M (R,), set to 1 where a ray is rejected: its error exceeds its threshold (is_outlier), and M
+    exceeds a bar. The bar starts at 0: at first every outlier is rejected. That may be structure
+    not learnt yet, but not for long: it errs in all photos, and this raises the threshold
     (UsualErrors, below). The bar reaches 1 at REJECTION of training; then M alone decides. [D3]"""
     bar = (done / REJECTION) ** 2  # squared: it rises late
     return mask.masked_fill(is_outlier & (mask > bar), 1)
@@ -1158,7 +1158,7 @@ class GeoNVS(nn.Module):
 
     def losses(self, rays, photos, done, gen):
         """The objective, and a dictionary for the log, of rays that come photo by photo, equally
-        many of each of photos (B,); done: share of training, 0..1. Calls update_statistics."""
+        many of each of photos (B,); done: share of training, 0..1. Also calls update_statistics."""
         R = len(rays.o)
         code = self.appearance(photos).repeat_interleave(R // len(photos), 0)  # (R,A)
         hits = self.trace(rays, code, gen)
