@@ -871,11 +871,11 @@ def complexity(e_grad, e_curv):
 
 
 def edge_indicator(ray_complexity, opacity):
-    """Phi (R,), Eq. 4: opacity sigmoid((x - mean) / deviation), x being the log of the complexity.
-    The paper calibrates its sigmoid, but does not say how. Here mean and deviation are those of x
-    over the step's rays, weighted by opacity, so that Phi tells edges from flat walls at any scale.
-    Phi is 0 where opacity (R,) is: on rays through air, which have no edge, and where the caller
-    sets it to 0, as a user's mask excludes the pixel. [D2]"""
+    """Phi (R,), Eq. 4: opacity times sigmoid((x - mean) / deviation), x being the logarithm of the
+    complexity. The paper calibrates its sigmoid, but does not say how. Here mean and deviation are
+    those of x over the step's rays, weighted by opacity, so that Phi tells edges from flat walls at
+    any scale. The factor opacity (R,) makes Phi 0 on rays through air, which have no edge. The
+    caller sets it to 0 where a user's mask excludes the pixel, too. [D2]"""
     weight = opacity / opacity.sum().clamp_min(1e-6)  # (R,)
     x = (ray_complexity + 1e-3).log()
     mean = (weight * x).sum()
