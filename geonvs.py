@@ -184,18 +184,13 @@ GPU_DEFAULTS = dict(steps=75_000, rays=16_384, photos=16, samples=32, appearance
 
 @dataclass
 class Processes:
-    """The processes that torchrun started, or this one alone. Each process draws its own rays and
-    keeps its own error quantiles (UsualErrors). Gradients are averaged, so all hold the same
-    weights. The first process decides, prints and saves. One process on a CPU resumes bit for
-    bit. A GPU adds floats in any order, and of several processes only the first keeps its random
-    numbers."""
+    """The processes that torchrun started, or this one alone. Each draws its own rays and keeps its
+    own error quantiles (UsualErrors). Gradients are averaged, so all hold the same weights. Rank 0
+    decides, prints and saves. One process on a CPU resumes bit for bit. A GPU adds floats in any
+    order, and of several processes only the first keeps its random numbers."""
     count: int = 1
     rank: int = 0
     local_rank: int = 0  # on this machine: the number of the process's GPU
-
-    @property
-    def is_first(self):
-        return self.rank == 0
 
     def join(self, device):
         """Connects this process with the others. All but the first stop printing."""
@@ -204,7 +199,7 @@ class Processes:
             torch.cuda.set_device(device)
         has_nccl = device.type == "cuda" and dist.is_nccl_available()  # not on Windows
         dist.init_process_group("cpu:gloo,cuda:nccl" if has_nccl else "gloo")
-        if not self.is_first:
+        if self.rank > 0:
             sys.stdout = open(os.devnull, "w", errors="replace")
 
     def share(self, value):
@@ -1291,9 +1286,8 @@ class GeoNVS(nn.Module):
 # ---- 8 Energy ------------------------------------------------------------------------------------
 
 def metered_joules(device, joules, processes=ALONE):
-    """Yields the joules that the GPUs of all processes have spent since the first call, on top of
-    those given, from their NVML counters (Volta and newer). Ends once a counter fails, or if it had
-    failed before (joules None): that ends metering, not the run."""
+    """Yields the joules given and those that the GPUs of all processes spent since the first call,
+    by their NVML counters (Volta and newer). Ends when one fails, or had failed (joules None)."""
     try:
         check(device.type == "cuda", "only GPUs are metered")
         import pynvml
@@ -1336,9 +1330,8 @@ def make_optimizer(model):
 
 
 def training_step(model, optimizer, step, done, gen, processes=ALONE):
-    """One update; the learning rate rises for 20 steps, then follows a cosine down to 5 %. done:
-    share of training, 0..1. Returns the log of GeoNVS.losses and the total. Never waits for the
-    device."""
+    """One update. The learning rate rises for 20 steps, then follows a cosine down to 5 %. done:
+    share of training, 0..1. Returns GeoNVS.losses' log and total. Never waits for the device."""
     if step % CACHE_EVERY == 0:
         model.refresh_cache()
     model.raise_zeta(done)
@@ -1347,10 +1340,9 @@ def training_step(model, optimizer, step, done, gen, processes=ALONE):
     optimizer.zero_grad()
     loss.backward()
     processes.average_gradients(model)
-    warm_up = min(1, (step + 1) / 20)
-    decay = 0.525 + 0.475 * math.cos(math.pi * done)
+    rate = min(1, (step + 1) / 20) * (0.525 + 0.475 * math.cos(math.pi * done))
     for group in optimizer.param_groups:
-        group["lr"] = warm_up * decay * group["base_lr"]
+        group["lr"] = rate * group["base_lr"]
     optimizer.step()
     return terms | dict(total=loss.detach())
 
@@ -1365,18 +1357,16 @@ def fingerprint(scene):
     sightings = np.bincount(raw["track_photo"], minlength=count)
     # colours weigh a hundredth, as programs decode photos in slightly different ways
     color = scene.thumbs.mean((2, 3), dtype=torch.float).cpu().numpy() / 255 / 100  # (I,3)
-    columns = [
-        np.arange(count), raw["is_test"], raw["wh"], raw["K"], raw["c2w"], color, masked_share,
-        sightings]
-    photos = np.hstack([np.reshape(column, (count, -1)) for column in columns])
+    photos = np.column_stack([
+        np.arange(count), raw["is_test"], raw["wh"], raw["K"], raw["c2w"].reshape(count, 12), color,
+        masked_share, sightings])
     sphere = np.hstack([raw["center"] / raw["scale"], np.log(raw["scale"]), raw["points"].mean(0)])
-    rows = [row.tolist() for row in (*photos, sphere)]
-    return dict(zip([*raw["name"].tolist(), "the sphere"], rows))
+    return dict(zip(raw["name"].tolist(), photos.tolist())) | {"the sphere": sphere.tolist()}
 
 
 def save(run, model, optimizer, gen, state, terms):
-    """Adds a line to the log, writes checkpoint.pt (with the log in it) and log.jsonl, and prints.
-    terms: the step's losses."""
+    """Adds a line to the log, writes checkpoint.pt (with the log in it) and log.jsonl, prints, and
+    removes the results of a shorter training. terms: the step's losses."""
     line = dict(step=state.step, seconds=state.seconds, joules=state.joules)
     line |= {key: value.item() for key, value in terms.items()}
     line["psnr"] = -10 * math.log10(line["mse"] + 1e-10)  # of the step's rays, people included
@@ -1399,11 +1389,13 @@ def save(run, model, optimizer, gen, state, terms):
     atomic_write(log, lambda part: part.write_text("".join(state.log)))
     done = min(1, state.share_done(model.cfg))
     print(f"  {done:4.0%}  step {state.step}  psnr {line['psnr']:.2f}", flush=True)
+    for name in ("metrics.json", "codes.npy", "panel.png", "mesh.ply", "film.mp4"):
+        (run / name).unlink(missing_ok=True)
+    shutil.rmtree(run / "held_out", ignore_errors=True)
 
 
 def read_checkpoint(path, given):
-    """A checkpoint's dictionary, of tensors and plain values, never code; and its settings,
-    replaced by those given."""
+    """A checkpoint's dictionary, plain values and never code; its settings, or those given."""
     check(path.exists(), f"{path} does not exist: train first, without --resume or --render, or "
           "name the run by the --scene, --data, --seed, --paper or --name it was made with")
     what = f"{path} is damaged, too large, or of another version of geonvs.py"
@@ -1424,9 +1416,8 @@ def restore(saved, model, gen=None):
             old.get(name, math.nan), new.get(name, math.nan), rtol=0, atol=5e-5)]
     check(not changed, "checkpoint.pt was trained with other photos, cameras, masks or points: "
           f"{len(changed)} differ, first {changed[:1]}: use its data, or another --name")
-    what = "checkpoint.pt does not fit settings or kind of device"
-    advice = "use those it was made with, or train under another --name"
-    with as_user_error(Exception, what, advice):
+    with as_user_error(Exception, "checkpoint.pt does not fit settings or kind of device",
+                       "use those it was made with, or train under another --name"):
         for octree, keys in zip(model.octrees, saved["octrees"], strict=True):
             octree.corner_key = octree.corner_key[:0]  # no corner is carried over
             octree.features = nn.Parameter(octree.features[:0])
@@ -1478,13 +1469,6 @@ def check_finite(tensors, cfg):
           "rates --lr_grid and --lr_net; an older checkpoint.pt, if any, is still there")
 
 
-def remove_results(run):
-    """Removes what a finished run wrote."""
-    for name in ("metrics.json", "codes.npy", "panel.png", "mesh.ply", "film.mp4"):
-        (run / name).unlink(missing_ok=True)
-    shutil.rmtree(run / "held_out", ignore_errors=True)
-
-
 def start(cfg, scene, saved=None, processes=ALONE):
     """Model, optimiser, generator and State: new ones, or those of a checkpoint, `saved`."""
     torch.manual_seed(cfg.seed)
@@ -1494,10 +1478,10 @@ def start(cfg, scene, saved=None, processes=ALONE):
         model = GeoNVS(cfg, scene)
     if saved is None:
         return model, make_optimizer(model), gen, State()
-    # the first process goes on with its random numbers, the others begin theirs again
-    optimizer, state = restore(saved, model, gen if processes.is_first else None)
-    if not processes.is_first:
-        model.sdf.octree.cell_error.zero_()  # saved sums are those of the first process
+    optimizer, state = restore(saved, model, gen)
+    if processes.rank > 0:  # random numbers and sums of errors are those of the first process
+        gen.manual_seed(own_seed)
+        model.sdf.octree.cell_error.zero_()
     return model, optimizer, gen, state
 
 
@@ -1512,7 +1496,7 @@ def train(cfg, scene, run, saved=None, processes=ALONE):
     if done >= 1:
         print("  nothing is left to train: give more --steps or --minutes; it is scored again")
         model.cfg = Config(**saved["config"])  # what was trained, not what was asked for now
-    if saved and done < 1 and processes.is_first:
+    elif saved and processes.rank == 0:
         atomic_write(run / "log.jsonl", lambda part: part.write_text("".join(state.log)))
     meter = metered_joules(gen.device, state.joules, processes)
     next(meter, None)  # it counts from here
@@ -1540,10 +1524,9 @@ def train(cfg, scene, run, saved=None, processes=ALONE):
             if done >= 1 or is_stopped or state.seconds >= next_log:  # in all processes at once
                 next_log = state.seconds + LOG_EVERY
                 check_finite(model.parameters(), cfg)
-                if processes.is_first:
+                if processes.rank == 0:
                     state.joules = next(meter, None)  # None, never 0, once a counter has failed
                     save(run, model, optimizer, gen, state, terms)
-                    remove_results(run)  # of a shorter training
     if caught or is_stopped:
         raise KeyboardInterrupt(
             f"stopped; step {state.step} is saved, and the same command with --resume goes on")
@@ -1902,10 +1885,10 @@ def pick_device(name, processes=ALONE):
 def make_config(given):
     """Config's defaults, then GPU_DEFAULTS if photos meet a GPU, then flags."""
     cfg = Config(**given)
-    is_toy = cfg.source == "toy"
-    check(not is_toy or "downscale" not in given,
-          "--downscale is for photos: a toy's size is that of data_prep.py toy --size")
-    if not is_toy and pick_device(cfg.device).type == "cuda":
+    if cfg.source == "toy":
+        check("downscale" not in given,
+              "--downscale is for photos: a toy's size is that of data_prep.py toy --size")
+    elif pick_device(cfg.device).type == "cuda":
         cfg = Config(**GPU_DEFAULTS | given)
     return cfg
 
@@ -1932,19 +1915,17 @@ def main(argv=None):
           "beside it by --name NAME, or delete the folder to replace it")
     check(cfg.rays % cfg.photos == 0,
           f"--rays {cfg.rays} must be a multiple of --photos {cfg.photos}")
-    processes = ALONE
-    if os.environ.get("WORLD_SIZE", "1") != "1":  # torchrun says so
-        numbers = [os.environ.get(key, 0) for key in ("WORLD_SIZE", "RANK", "LOCAL_RANK")]
-        processes = Processes(*map(int, numbers))
+    numbers = [int(os.environ.get(key, 0)) for key in ("WORLD_SIZE", "RANK", "LOCAL_RANK")]
+    processes = Processes(*numbers) if numbers[0] > 1 else ALONE  # torchrun says so
     device = pick_device(cfg.device, processes)
     if processes.count > 1:
         processes.join(device)
-        if processes.is_first:
+        if processes.rank == 0:
             find_scene(cfg)  # the others find it made
         dist.barrier()
     scene = load_scene(find_scene(cfg), device)
     model, state = train(cfg, scene, run, saved, processes)
-    if processes.is_first:
+    if processes.rank == 0:
         finish(model, scene, state, run, processes)
     if processes.count > 1:
         dist.destroy_process_group()
