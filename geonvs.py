@@ -1598,8 +1598,7 @@ def score(rgb, truth, masked, lpips=None):
     of 11 px with sigma 1.5 and no border. Pixels that a user's mask excludes, masked (H,W), are
     left out. None where a picture is too small, or nothing is left of it."""
     half = truth.shape[1] // 2
-    left = truth[:, :half]
-    want = truth[:, half:]
+    left, want = np.split(truth, [half], axis=1)
     is_scored = ~masked[:, half:]
     row = dict(psnr=None, psnr_floor=None, ssim=None, lpips=None)
     row["masked_pixels"] = int((~is_scored).sum())
@@ -1668,8 +1667,7 @@ def extract_mesh(model):
     surface; elsewhere the cache gives its sign."""
     n = min(round(2 / model.eps), 512)
     cache = model.cache
-    s = cache.volume[:, :1]
-    volume = F.interpolate(s, n + 1, mode="trilinear", align_corners=True)[0, 0]
+    volume = F.interpolate(cache.volume[:, :1], n + 1, mode="trilinear", align_corners=True)[0, 0]
     square = torch.linspace(-1, 1, n + 1, device=volume.device) ** 2
     square = square[:, None, None] + square[:, None] + square  # (n+1,n+1,n+1) squared radius
     is_close = (square < 1.1) & (volume.abs() < 3 * cache.side)
@@ -1685,15 +1683,13 @@ def extract_mesh(model):
 
 @torch.no_grad()
 def mesh_colors(model, vertices):
-    """Colours (P,3) of vertices (P,3) in SfM units, seen along their normals in the mean light of
-    the training photos."""
+    """Colours (P,3) of vertices (P,3) in SfM units, seen along their normals in the mean light."""
     scene = model.scene
     mean = model.codes()[scene.train].mean(0)  # (A,)
 
     def colors(x):
         _, geo = model.sdf(x)  # (P,G)
-        _, grad, _ = model.sdf.derivatives(x, model.eps)
-        normal = F.normalize(grad)
+        normal = F.normalize(model.sdf.derivatives(x, model.eps)[1])
         per_ray = torch.cat([normal, -normal, mean.expand(len(x), -1)], 1)  # (P,3+3+A)
         return colors_of(model.color, geo[:, None], per_ray)[:, 0]
     x = (vertices - scene.raw["center"]) / scene.raw["scale"]
@@ -1768,8 +1764,7 @@ def film(model, scene, path):
 
 
 def make_lpips():
-    """The network of LPIPS, a learned perceptual distance (AlexNet, v0.1), on the CPU like the
-    pictures that are scored; or None with a line."""
+    """LPIPS (AlexNet, v0.1), a learned perceptual distance, on the CPU; or None with a line."""
     try:
         import lpips
         return lpips.LPIPS(net="alex", verbose=False)
@@ -1802,17 +1797,7 @@ def finish(model, scene, state, run, processes=ALONE):
     is_cuda = scene.c2w.is_cuda
     threads = f"cpu, {torch.get_num_threads()} threads"
     buffers = [tensor for octree in model.octrees for tensor in octree.buffers()]
-    memory = peak_memory(is_cuda)  # up to here: not of scoring
-    pictures = {}
-    scores, codes = evaluate(model, scene, make_lpips(), pictures)
-    fitted = "appearance fitted on the left half, " if codes.numel() else ""
-    atomic_write(run / "codes.npy", lambda part: np.save(part, codes.cpu()))
-    vertices, faces = extract_mesh(model)
-    if len(faces) == 0:
-        print(f"  {run}/mesh.ply is empty: no surface lies in the unit sphere; train longer")
-    write_ply(run / "mesh.ply", vertices, faces, to_uint8(mesh_colors(model, vertices)))
-    if "wall" in scene.raw:
-        scores |= toy_truth(model, scene)
+    fitted = "appearance fitted on the left half, " if model.codes().numel() else ""
     metrics = dict(
         scene=scene.info["scene"],
         method=model.name,
@@ -1826,13 +1811,22 @@ def finish(model, scene, state, run, processes=ALONE):
         parameters=sum(p.numel() for p in model.parameters()),
         model_bytes=sum(tensor.nbytes for tensor in [*model.parameters(), *buffers]),
         octree_cells=model.sdf.octree.cells[:, 0].bincount().tolist(),  # by level
-        peak_memory_bytes=memory,
+        peak_memory_bytes=peak_memory(is_cuda),  # up to here: not of scoring
         protocol=fitted + "scored on the right half",
         has_mask=model.has_mask,
         torch=torch.__version__,
         commit=code_version(),
-        config=vars(cfg),
-        **scores)
+        config=vars(cfg))
+    pictures = {}
+    scores, codes = evaluate(model, scene, make_lpips(), pictures)
+    metrics |= scores
+    atomic_write(run / "codes.npy", lambda part: np.save(part, codes.cpu()))
+    vertices, faces = extract_mesh(model)
+    if len(faces) == 0:
+        print(f"  {run}/mesh.ply is empty: no surface lies in the unit sphere; train longer")
+    write_ply(run / "mesh.ply", vertices, faces, to_uint8(mesh_colors(model, vertices)))
+    if "wall" in scene.raw:
+        metrics |= toy_truth(model, scene)
     atomic_write(run / "metrics.json", lambda part: part.write_text(json.dumps(metrics, indent=1)))
     write_picture(run / "panel.png", lambda: draw_panel(model, scene, codes))
     for name, picture in pictures.items():
