@@ -1319,9 +1319,7 @@ class State:
 
     def share_done(self, cfg):
         """Share of training that is done, of steps or minutes; 1 or more: it is over."""
-        if cfg.minutes > 0:
-            return self.seconds / (60 * cfg.minutes)
-        return self.step / cfg.steps
+        return self.seconds / (60 * cfg.minutes) if cfg.minutes > 0 else self.step / cfg.steps
 
 
 def make_optimizer(model):
@@ -1453,7 +1451,7 @@ def load_run(run, **given):
     scene = load_scene(find_scene(cfg, run.parent.parent), device)
     with device:
         model = GeoNVS(cfg, scene)
-    _, state = restore(saved, model)
+    restore(saved, model)
     model.refresh_cache()  # a run that was stopped has an older cache
     codes = model.codes()
     if (run / "codes.npy").exists():  # finished: codes of test photos are fitted
@@ -1721,8 +1719,7 @@ def draw_panel(model, scene, codes):
             tiles.append(to_uint8(np.dstack([M] * 3)))
             text += ", mask (white: transient)"
         h, w, _ = rgb.shape
-        size = (240, 240 * h // w)
-        row = [cv2.resize(tile, size, interpolation=cv2.INTER_AREA) for tile in tiles]
+        row = [cv2.resize(tile, (240, 240 * h // w), interpolation=cv2.INTER_AREA) for tile in tiles]
         row = np.insert(np.hstack(row), [0] * 20, 255, axis=0)  # 20 white lines for the title
         cv2.putText(row, text, (2, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.4, 0)
         rows.append(row)
