@@ -1374,13 +1374,9 @@ def save(run, model, optimizer, gen, state, terms):
           "--resume, or train beside it by --name NAME")
     state.log.append(json.dumps(line) + "\n")
     saved = dict(
-        config=vars(model.cfg),
-        scene=fingerprint(model.scene),
-        octrees=[octree.split_keys.clone() for octree in model.octrees],
-        model=model.state_dict(),
-        optimizer=optimizer.state_dict(),
-        generator=gen.get_state(),
-        state=vars(state))
+        config=vars(model.cfg), state=vars(state), scene=fingerprint(model.scene),
+        model=model.state_dict(), optimizer=optimizer.state_dict(), generator=gen.get_state(),
+        octrees=[octree.split_keys.clone() for octree in model.octrees])
     buffer = io.BytesIO()  # as torch.save calls a full disk a RuntimeError
     torch.save(saved, buffer)
     atomic_write(run / "checkpoint.pt", lambda part: part.write_bytes(buffer.getbuffer()))
@@ -1796,10 +1792,7 @@ def finish(model, scene, state, run, processes=ALONE):
     buffers = [tensor for octree in model.octrees for tensor in octree.buffers()]
     fitted = "appearance fitted on the left half, " if model.codes().numel() else ""
     metrics = dict(
-        scene=scene.info["scene"],
-        method=model.name,
-        seed=cfg.seed,
-        steps=state.step,
+        scene=scene.info["scene"], method=model.name, seed=cfg.seed, steps=state.step,
         device=torch.cuda.get_device_name() if is_cuda else threads,
         train_seconds=state.seconds,
         energy_wh=state.joules / 3600 if is_metered else None,
@@ -1810,10 +1803,7 @@ def finish(model, scene, state, run, processes=ALONE):
         octree_cells=model.sdf.octree.cells[:, 0].bincount().tolist(),  # by level
         peak_memory_bytes=peak_memory(is_cuda),  # up to here: not of scoring
         protocol=fitted + "scored on the right half",
-        has_mask=model.has_mask,
-        torch=torch.__version__,
-        commit=code_version(),
-        config=vars(cfg))
+        has_mask=model.has_mask, torch=torch.__version__, commit=code_version(), config=vars(cfg))
     pictures = {}
     scores, codes = evaluate(model, scene, make_lpips(), pictures)
     metrics |= scores
@@ -1853,11 +1843,8 @@ def make_parser():
             group = parser.add_argument_group(GROUPS[option.name])
         alone = option.metadata.get("alone")
         group.add_argument(
-            f"--{option.name}",
-            type=option.type,
-            nargs="?" if alone else None,
-            const=alone,
-            metavar=option.type.__name__.upper(),
+            f"--{option.name}", type=option.type, metavar=option.type.__name__.upper(),
+            nargs="?" if alone else None, const=alone,
             default=argparse.SUPPRESS,  # for make_config, which has to know what was given
             help=f"{option.metadata['meaning']} [{option.default}]".removesuffix(" []"))
     return parser
