@@ -1715,7 +1715,8 @@ def draw_panel(model, scene, codes):
             tiles.append(to_uint8(np.dstack([M] * 3)))
             text += ", mask (white: transient)"
         h, w, _ = rgb.shape
-        row = [cv2.resize(tile, (240, 240 * h // w), interpolation=cv2.INTER_AREA) for tile in tiles]
+        size = (240, 240 * h // w)
+        row = [cv2.resize(tile, size, interpolation=cv2.INTER_AREA) for tile in tiles]
         row = np.insert(np.hstack(row), [0] * 20, 255, axis=0)  # 20 white lines for the title
         cv2.putText(row, text, (2, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.4, 0)
         rows.append(row)
