@@ -508,10 +508,11 @@ def test_a_scene_survives_colmap_files(in_tmp_dir, images, sparse, names, on_dis
     for name in copies.split():
         put(Path("place", images, name), encoded(BLACK, ".jpg"))
     put(Path("place", images, "raw.dng"), encoded(BLACK, ".tiff"))
+    put(Path("place", images, "a photo"), encoded(BLACK, ".jpg"))  # known by its content
     put(Path("place", mask), encoded(CORNER, Path(mask).suffix))
     scene, out, err = made("--downscale 1")
     assert not err
-    assert "8 photos on disk, 8 posed" in out
+    assert "9 photos on disk, 8 posed" in out
     assert f"radius of {scene['scale']:.3g} units" in out
     assert f"{scene['masked'].mean():.0%} of all pixels, in 1 of 8 photos" in out
     assert photo(scene, 0, "masked")[:8, :8].all()
@@ -768,7 +769,7 @@ LISTS = {
     commas=({"nerfw_split.csv": ROWS.replace("\t", ",")}, "", "nerfw_split.csv"),
     of_windows=({"s.csv": OF_WINDOWS}, "", "s.csv"),
     quoted=({"s.csv": re.sub(r"([^\t\n]+)", r'"\1"', ROWS).replace("\t", ",")}, "", "s.csv"),
-    named_elsewhere=({"s.tsv": ROWS, "../mine.tsv": ROWS}, "--split mine.tsv", "mine.tsv"),
+    named_elsewhere=({"s.tsv": "split\nx", "../mine.tsv": ROWS}, "--split mine.tsv", "mine.tsv"),
     lists=(LISTS, "", "train_list.txt"),
     named_list=(LISTS, "--split place/test_list.txt", "train_list.txt"))
 def test_a_split_is_found_read_and_remembered(model, files, flags, first):
