@@ -1243,8 +1243,7 @@ def gradients(model, value):
 
 
 # ---- 1 settings ----------------------------------------------------------------------------------
-LEAST = dict(
-    steps=1, downscale=1, rays=2, photos=1, samples=3, bg_samples=2, hidden=1, lam_gpl=0)
+LEAST = dict(steps=1, downscale=1, rays=2, photos=1, samples=3, bg_samples=2, hidden=1, lam_gpl=0)
 
 
 @pytest.mark.parametrize("name, value", [
@@ -1527,14 +1526,6 @@ def test_samples_crowd_at_the_first_surface(warm, double):
     assert_tensors_close(at_large_zeta, t)  # not below a voxel
 
 
-def plain_sdf(model, x):
-    """s () and geometry (G,) at x (3,)."""
-    first, _, last = model.sdf.network
-    features = model.plain[0](x)
-    out = last(first(torch.cat([x, features])).relu())
-    return x.norm() - 0.25 + out[0], torch.cat([out[1:], features])
-
-
 def plain_weights(alphas):
     """Weights (S,) of intervals with these opacities, front to back."""
     passing = [math.prod(1 - (1 - 1e-6) * a for a in alphas[:i]) for i in range(len(alphas))]
@@ -1562,7 +1553,10 @@ def plain_background(model, o, d, t0, t1, near, per_ray, before, beyond):
 
 def plain_render(model, o, d, near, t, code, *parts):
     """What trace and shade return for one ray with samples at t (S+1,), in one row."""
-    s, geo = map(torch.stack, zip(*[plain_sdf(model, o + distance * d) for distance in t]))
+    x = o + t[:, None] * d
+    features = torch.stack(list(map(model.plain[0], x)))
+    out = model.sdf.network(torch.hstack([x, features]))
+    s = x.norm(dim=1) - 0.25 + out[:, 0]
     start, end = s[:-1], s[1:]
     zeta = torch.exp(10 * model.deviation)
     fall = 1 - (zeta * end).sigmoid() / (zeta * start).sigmoid()
@@ -1579,7 +1573,8 @@ def plain_render(model, o, d, near, t, code, *parts):
     _, grad, _ = model.sdf.derivatives(point[None], model.eps)
     normal = grad[0] / grad.norm()
     per_ray = torch.cat([normal, d, code])
-    colors = model.color(torch.hstack([geo, per_ray.expand(len(t), -1)])).sigmoid()
+    inputs = torch.hstack([out[:, 1:], features, per_ray.expand(len(t), -1)])
+    colors = model.color(inputs).sigmoid()
     rgb = w @ (colors[:-1] + colors[1:]) / 2
     before, passed, beyond, bg_place = 0, 1, model.bg_color, 2 * d
     if model.background:
@@ -1684,12 +1679,9 @@ def test_phi_depends_on_ratios_of_complexity(double):
 # ---- 7 model and objective -----------------------------------------------------------------------
 def test_batches_come_photo_by_photo_from_training_photos(warm):
     gen = generator()
-    met = set()
-    for _ in range(20):
-        rays, photos = warm.batch(64, gen)
-        assert torch.equal(rays.photo, photos.repeat_interleave(16))
-        met.update(photos.tolist())
-    assert met == {0, 1, 3, 4, 5, 7}  # the others are held out
+    batches = [warm.batch(64, gen) for _ in range(20)]
+    assert all(torch.equal(rays.photo, photos.repeat_interleave(16)) for rays, photos in batches)
+    assert torch.equal(torch.cat([photos for _, photos in batches]).unique(), warm.scene.train)
 
 
 def plain_phi(model, rays, hits):
@@ -1906,11 +1898,9 @@ class OneDevice(TorchDispatchMode):
     host's, as a GPU takes it along with the call, unless it is copied."""
     def __torch_dispatch__(self, function, types, args=(), kwargs=None):
         result = function(*args, **(kwargs or {}))
-        is_copy = "copy" in str(function)
         tensors = filter(torch.is_tensor, tree_leaves([args, kwargs, result]))
-        devices = {x.device for x in tensors if is_copy or x.dim() > 0}
-        if len(devices) > 1:
-            raise RuntimeError(f"{function} on {devices}")
+        devices = {x.device for x in tensors if "copy" in str(function) or x.dim() > 0}
+        assert len(devices) < 2, f"{function} on {devices}"
         return result
 
 
@@ -2063,23 +2053,21 @@ def test_of_two_processes_in_a_folder_one_goes_on(loop):
     with pytest.raises(UserError, match="another process"):
         run_training()
     assert read_saved()["state"]["step"] == 1
-    CHECKPOINT.unlink()
-    with pytest.raises(UserError, match="another process"):
-        run_training()  # both began at once
-    assert not CHECKPOINT.exists()
 
 
 @cases(
-    "laps, seconds",
-    none=([1.0] * 9, 9),
-    paused=([1.0, 1.0, 1.0, 600.0, 1.0], 24),
-    short=([0.1, 0.1, 9.9], 10.1),  # seconds can be a checkpoint on a slow disk
-    slow=([1.0, 1.0, 19.0], 21),
-    slower=([9.0, 60.0, 90.0], 159))
-def test_a_pause_counts_as_twenty_steps_at_most(loop, monkeypatch, laps, seconds):
+    "laps, seconds, count",
+    none=([1.0] * 9, 9, 1),
+    paused=([1.0, 1.0, 1.0, 600.0, 1.0], 24, 1),
+    short=([0.1, 0.1, 9.9], 10.1, 1),  # seconds can be a checkpoint on a slow disk
+    slow=([1.0, 1.0, 19.0], 21, 1),
+    slower=([9.0, 60.0, 90.0], 159, 1),
+    of_two_processes=([10.0] * 5, 50, 2))  # told after the last step
+def test_a_pause_counts_as_twenty_steps_at_most(loop, monkeypatch, laps, seconds, count):
     clock = itertools.accumulate([5.0, *laps])
     monkeypatch.setattr(geonvs, "time", SimpleNamespace(perf_counter=clock.__next__))
-    _, state = run_training(steps=len(laps))
+    monkeypatch.setattr(geonvs.Processes, "share", lambda self, value: value)
+    _, state = run_training(processes=geonvs.Processes(count), steps=len(laps))
     assert state.seconds == pytest.approx(seconds)
 
 
@@ -2280,12 +2268,6 @@ def test_two_processes_train_one_model(in_tmp_dir):
     assert "no longer finite" in error_a  # both noticed it
 
 
-def test_several_processes_count_all_seconds(loop, monkeypatch):
-    monkeypatch.setattr(geonvs.Processes, "share", lambda self, value: value)
-    _, state = run_training(processes=geonvs.Processes(2), steps=5)
-    assert state.seconds == 50  # told after the last step
-
-
 def test_processes_come_from_torchrun_and_the_first_makes_the_scene(in_tmp_dir, monkeypatch):
     events = mock.Mock()
     events.open.side_effect = [None, KeyboardInterrupt]
@@ -2481,9 +2463,8 @@ def test_vertices_have_the_colours_of_rays(warm):
 
 
 def test_depth_is_red_near_blue_far():
-    depth = np.array([[1.0, 2.0, 9.0]])
-    opacity = np.array([[1.0, 1.0, 0.0]])
-    near, far, nothing = geonvs.depth_picture(depth, opacity)[0].astype(int)
+    picture = geonvs.depth_picture(np.array([[1.0, 2.0, 9.0]]), np.array([[1.0, 1.0, 0.0]]))
+    near, far, nothing = picture[0].astype(int)
     assert near[0] > near[2] + 50
     assert far[2] > far[0]
     assert not nothing.any()
