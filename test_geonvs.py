@@ -2403,8 +2403,7 @@ def plain_edges(depth):
     q = 1 / np.pad(depth.astype(np.float32), 1, constant_values=np.nan)
     edges = np.zeros(depth.shape, bool)
     for row, col in np.ndindex(depth.shape):
-        window = q[row:row + 3, col:col + 3]
-        for before, here, after in (window[:, 1], window[1]):
+        for before, here, after in (q[row:row + 3, col + 1], q[row + 1, col:col + 3]):
             bend = abs(2 * here - before - after)  # nan at a border
             edges[row, col] |= bend > 0.05 * max(before, here, after)
     return edges
