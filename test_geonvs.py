@@ -1526,6 +1526,19 @@ def test_samples_crowd_at_the_first_surface(warm, double):
     assert_tensors_close(at_large_zeta, t)  # not below a voxel
 
 
+@pytest.mark.parametrize("zeta", [20, 480, 1e4])
+def test_the_hit_is_where_a_plane_is(double, zeta):
+    """Within a tenth of the finest step of differences, whatever samples and sharpness."""
+    eps = 1 / geonvs.ROOT / 2**7 / 2  # at eight levels
+    plane = 2.0 + random(200, 1)  # distances along rays
+    t = plane + random(200, 16, low=-0.1, high=0.1).sort().values
+    t[:, [0, -1]] = torch.tensor([1.0, 4.0])
+    sdf = random(200, 1, low=0.3) * (plane - t)
+    w = geonvs.composite(geonvs.neus_alpha(sdf, zeta))
+    assert_tensors_close(geonvs.surface_depth(t, sdf, w), plane[:, 0], eps / 10)
+    assert_tensors_close(geonvs.surface_depth(t, sdf, 0 * w), t[:, -1])
+
+
 def plain_weights(alphas):
     """Weights (S,) of intervals with these opacities, front to back."""
     passing = [math.prod(1 - (1 - 1e-6) * a for a in alphas[:i]) for i in range(len(alphas))]
@@ -2668,6 +2681,7 @@ MISTAKES = """
 @pytest.mark.parametrize("flags", re.split(r",\s", MISTAKES.strip()))
 def test_a_mistake_is_one_line_and_changes_no_run(command, flags):
     CHECKPOINT.unlink()  # results are a run, too
+    (RUN / "log.jsonl").unlink()
     before = {path: path.read_bytes() for path in RUN.rglob("*.*")}
     assert_refused(command(f"{FLAGS} {flags}"), "")
     assert {path: path.read_bytes() for path in Path("runs").rglob("*.*")} == before
