@@ -2100,6 +2100,44 @@ def test_a_resumed_run_adds_to_what_was_spent(loop, monkeypatch):
     assert not result.exists()
 
 
+def start_child(function, **env):
+    """A new process that calls a function of this file."""
+    code = f"import sys; sys.path[:0] = {sys.path}; import {__name__}; {__name__}.{function}()"
+    return subprocess.Popen(
+        [sys.executable, "-c", code], env=os.environ | env, text=True, stdout=subprocess.PIPE)
+
+
+def train_with_signal(number, step):
+    """Trains, and gets a signal in a step."""
+    def step_with_signal(*args, train=geonvs.training_step):
+        if args[2] == step:
+            signal.raise_signal(number)
+        return train(*args)
+    with mock.patch.object(geonvs, "training_step", step_with_signal):
+        run_training()
+
+
+def train_until_killed():
+    """Trains five steps of six, with a checkpoint at each."""
+    pass_time(pytest.MonkeyPatch(), seconds=100)
+    train_with_signal(signal.SIGKILL, step=5)
+
+
+def test_sigkill_and_resume_change_no_bit(whole, in_tmp_dir, monkeypatch):
+    code = start_child("train_until_killed").wait(600)
+    saved = read_saved()
+    with open(RUN / "log.jsonl", "a") as log:
+        log.write('{"step": 6}\n{"step":')  # a line without its checkpoint, and a torn one
+    pass_time(monkeypatch, seconds=100)
+    resumed, _ = run_training(saved)
+    cache = resumed.cache
+    assert code == -signal.SIGKILL
+    assert saved["state"]["step"] == 5
+    assert_same_tensors(resumed.state_dict(), whole.model.state_dict())
+    assert_tensors_close(cache.sdf(cache.points[None])[0], resumed.signed_distance(cache.points))
+    assert read_log() == whole.log
+
+
 STOPS = pytest.raises(KeyboardInterrupt, match="step 3 is saved")
 
 
@@ -2109,30 +2147,17 @@ STOPS = pytest.raises(KeyboardInterrupt, match="step 3 is saved")
     kill=(signal.SIGTERM, signal.default_int_handler, STOPS, 3),
     closed_terminal=(signal.SIGHUP, signal.default_int_handler, STOPS, 3),
     nohup=(signal.SIGHUP, signal.SIG_IGN, contextlib.nullcontext(), 6))
-def test_a_stopped_run_ends_its_step_and_resumes_bit_for_bit(
-        whole, in_tmp_dir, monkeypatch, number, handler, end, step):
-    def step_with_signal(*args, train=geonvs.training_step):
-        if args[2] == 2:
-            signal.raise_signal(number)
-        return train(*args)
-    pass_time(monkeypatch, seconds=100)
+def test_a_stopped_run_ends_its_step(whole, in_tmp_dir, number, handler, end, step):
     former = signal.signal(number, handler)  # a background job ignores Ctrl-C
     try:
-        with end, mock.patch.object(geonvs, "training_step", step_with_signal):
-            run_training()
+        with end:
+            train_with_signal(number, step=2)
         assert signal.getsignal(number) == handler
     finally:
         signal.signal(number, former)
-    saved = read_saved()
-    assert saved["state"]["step"] == step
-    if step < 6:  # as if it was killed: a line without its checkpoint, and a torn one
-        with open(RUN / "log.jsonl", "a") as log:
-            log.write('{"step": 4}\n{"step":')
-    resumed, _ = run_training(saved)
-    cache = resumed.cache
-    assert read_log() == whole.log
+    assert read_saved()["state"]["step"] == step
+    resumed, _ = run_training(read_saved())
     assert_same_tensors(resumed.state_dict(), whole.model.state_dict())
-    assert_tensors_close(cache.sdf(cache.points[None])[0], resumed.signed_distance(cache.points))
 
 
 def test_a_run_can_be_trained_in_a_thread(in_tmp_dir):
@@ -2259,15 +2284,10 @@ def train_as_one_of_two():
 
 
 def test_two_processes_train_one_model(in_tmp_dir):
-    code = f"import sys; sys.path[:0] = {sys.path}; import {__name__} as m; m.train_as_one_of_two()"
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = str(free.getsockname()[1])
-    env = os.environ | dict(MASTER_ADDR="127.0.0.1", MASTER_PORT=port, WORLD_SIZE="2")
-    pair = [
-        subprocess.Popen(
-            [sys.executable, "-c", code], env=env | dict(RANK=rank), text=True,
-            stdout=subprocess.PIPE)
-        for rank in "01"]
+    env = dict(MASTER_ADDR="127.0.0.1", MASTER_PORT=port, WORLD_SIZE="2")
+    pair = [start_child("train_as_one_of_two", RANK=rank, **env) for rank in "01"]
     said, silence = [process.communicate(timeout=600)[0] for process in pair]
     assert "step 16" in said
     assert silence == ""
@@ -2716,6 +2736,15 @@ def test_a_problem_in_training_is_one_line_but_a_bug_is_a_traceback(
     assert_refused(command(FLAGS), word)
     with pytest.raises(RuntimeError, match="shapes"):
         command(FLAGS)
+
+
+@pytest.mark.parametrize("part", ["evaluate", "extract_mesh"])
+def test_a_trained_run_outlives_full_memory(command, monkeypatch, part):
+    with monkeypatch.context() as patch:
+        patch.setattr(geonvs, part, mock.Mock(side_effect=RuntimeError("can't allocate memory")))
+        assert_refused(command(FLAGS), "end other programs")
+    assert command("--resume --name=b") == (0, "")
+    assert Path("runs/b/metrics.json").exists()
 
 
 def test_a_picture_that_fails_is_one_line(command, monkeypatch, capsys):
