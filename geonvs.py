@@ -297,8 +297,10 @@ def make_rays(scene, photo, pixel):
     wh = scene.wh[photo]  # (R,2)
     focal, centre = scene.K[photo].split(2, 1)  # (R,2)
     c2w = scene.c2w[photo]  # (R,3,4)
-    xy = torch.stack([pixel % wh[:, 0], pixel // wh[:, 0]], 1) + 0.5  # (R,2) px
-    d = F.normalize(F.pad((xy - centre) / focal, (0, 1), value=1.0))  # (R,3) in camera axes
+    w = wh[:, 0]
+    xy = torch.stack([pixel % w, pixel // w], 1) + 0.5  # (R,2) px
+    d = (xy - centre) / focal  # (R,2)
+    d = F.normalize(F.pad(d, (0, 1), value=1.0))  # (R,3) in camera axes
     d = torch.einsum("rij,rj->ri", c2w[..., :3], d)  # (R,3) in world axes
     index = scene.start[photo] + pixel  # (R,) among all pixels
     rgb = scene.rgb[index] / 255
@@ -592,7 +594,8 @@ def colors_of(network, geo, per_ray):
     """Colours (R,S,3) that a network reads from geometry (R,S,G) and what is the same for all
     samples of a ray (R,.)."""
     per_ray = per_ray[:, None].expand(-1, geo.shape[1], -1)  # (R,S,.)
-    return mixed_precision(network, torch.cat([geo, per_ray], 2)).sigmoid()
+    inputs = torch.cat([geo, per_ray], 2)
+    return mixed_precision(network, inputs).sigmoid()
 
 
 # a tetrahedron's centre and corners, which are 3^0.5 away; taps are scaled to length 1
@@ -706,7 +709,8 @@ def inverse_cdf(edges, weight, u):
     cdf = F.pad(cdf / cdf[:, -1:], (1, 0))  # (R,J+1)
     right = torch.searchsorted(cdf, u, right=True).clamp_max(weight.shape[1])  # (R,S) from 1
     left = right - 1
-    below, above = cdf.gather(1, left), cdf.gather(1, right)
+    below = cdf.gather(1, left)
+    above = cdf.gather(1, right)
     part = (u - below) / (above - below).clamp_min(1e-9)
     return edges.gather(1, left).lerp(edges.gather(1, right), part.clamp(0, 1))
 
@@ -725,7 +729,8 @@ def importance_samples(probes, alpha, u):
     weight = composite(alpha)
     uniform_weight = UNIFORM_SHARE * weight.mean(1, keepdim=True)
     weight = weight + uniform_weight + 1e-5  # an empty ray has uniform samples
-    return torch.cat([probes[:, :1], inverse_cdf(probes, weight, u), probes[:, -1:]], 1)
+    inner = inverse_cdf(probes, weight, u)
+    return torch.cat([probes[:, :1], inner, probes[:, -1:]], 1)
 
 
 class SDFCache(nn.Module):
@@ -808,7 +813,8 @@ class Background(nn.Module):
         w = composite(F.pad(alpha, (0, 1), value=1.0))  # (R,K) the last sample is opaque
         per_ray = torch.cat([rays.d, code], 1)  # (R,3+A)
         colors = w[..., None] * colors_of(self.color, geo, per_ray)  # (R,K,3)
-        near_color, far_color = [c.sum(1) for c in colors.split([n, self.samples - n], 1)]  # (R,3)
+        near_color = colors[:, :n].sum(1)  # (R,3)
+        far_color = colors[:, n:].sum(1)  # (R,3)
         near_trans = 1 - w[:, :n].sum(1, keepdim=True)  # (R,1)
         far_w = F.normalize(w[:, n:].detach(), p=1, dim=1)
         place = torch.einsum("rk,rkc->rc", far_w, x[:, n:])
@@ -898,7 +904,8 @@ def mask_loss(logit, excess):
     gradient where the sigmoid saturates. With L_GPL an outlier minimises
     -excess log M + lam_gpl M Phi (lam_mask is 1). Its best M is excess / (lam_gpl Phi), at most 1:
     an edge with Phi = 1 is masked fully only if excess is at least lam_gpl. [D3]"""
-    return F.binary_cross_entropy_with_logits(logit, (excess > 0).float(), excess.abs())
+    is_transient = (excess > 0).float()
+    return F.binary_cross_entropy_with_logits(logit, is_transient, excess.abs())
 
 
 def paper_mask_loss(mask, error):
@@ -941,7 +948,8 @@ class UsualErrors(nn.Module):
         down by 1 - PLACE_QUANTILE: they balance at the quantile (the pinball loss's gradient). A
         step multiplies the quantile by exp(QUANTILE_RATE times the mean push)."""
         cell = self.cell(place)
-        push = torch.where(error < self.quantile[cell], PLACE_QUANTILE - 1, PLACE_QUANTILE)
+        is_below = error < self.quantile[cell]
+        push = torch.where(is_below, PLACE_QUANTILE - 1, PLACE_QUANTILE)
         count = len(self.quantile)
         mean = push.new_zeros(count + 1)  # the last one is of rays that do not count
         cell = torch.where(is_chosen, cell, count)
@@ -970,7 +978,8 @@ class ContextBlock(nn.Module):
 
     def forward(self, x):
         y = self.reduce(x)  # (B,n,h/2,w/2)
-        y = self.norm(torch.cat([self.local(y), self.around(y)], 1)).relu()  # (B,2n,h/2,w/2)
+        y = torch.cat([self.local(y), self.around(y)], 1)
+        y = F.relu(self.norm(y))  # (B,2n,h/2,w/2)
         gate = self.gate(y.mean((2, 3))).sigmoid()  # (B,2n)
         return y * gate[..., None, None]
 
@@ -990,18 +999,21 @@ class TransientMask(nn.Module):
             nn.Sequential(conv(3, 16, stride=2), conv(16, 16, stride=1)),
             ContextBlock(16, dilation=2),
             ContextBlock(32, dilation=4))
-        # as logits are summed, one bias is enough
-        self.heads = nn.ModuleList([nn.Conv2d(n, 1, 1, bias=n == 16) for n in (16, 32, 64)])
+        self.heads = nn.ModuleList([
+            nn.Conv2d(16, 1, 1),
+            nn.Conv2d(32, 1, 1, bias=False),  # as logits are summed, one bias is enough
+            nn.Conv2d(64, 1, 1, bias=False)])
         nn.init.constant_(self.heads[0].bias, -2.5)  # starts with 8 % masked, not with half
         self.thumbs = nn.Buffer(thumbs, persistent=False)  # (I,3,2m,2m)
 
     def logits(self, photos):
         """Transient logits (B,1,m,m) of photos (B,)."""
         y = self.thumbs[photos] / 255 - 0.5  # (B,3,2m,2m)
+        size = y.shape[2] // 2
         logits = 0
         for stage, head in zip(self.stages, self.heads):
             y = stage(y)  # (B,16,m,m), (B,32,m/2,m/2), (B,64,m/4,m/4)
-            logits += F.interpolate(head(y), self.thumbs.shape[2] // 2, mode="bilinear")
+            logits += F.interpolate(head(y), size, mode="bilinear")
         return logits
 
 
@@ -1022,7 +1034,8 @@ def needed_parts(cfg, raw):
     pixels = 2 / raw["footprint"]  # across the sphere; footprint: a pixel's size there
     levels = int(np.clip(1 + np.log2(pixels / ROOT), 2, 8))  # no cell smaller than a pixel
     has_codes = is_on(cfg.appearance, raw["exposure_spread"] > 0.01)
-    has_background = is_on(cfg.background, np.isnan(raw["bg_color"]).any())  # nan: no one colour
+    has_no_color = np.isnan(raw["bg_color"]).any()  # nan: the background has no one colour
+    has_background = is_on(cfg.background, has_no_color)
     return cfg.levels or levels, cfg.appearance_dim if has_codes else 0, has_background
 
 
@@ -1115,9 +1128,11 @@ class GeoNVS(nn.Module):
         """Distances (R,S+1) of the samples between t0 and t1 (R,1), dense where the cache sees a
         surface. The cache knows where s is 0 to about half a voxel. So, to place samples, a
         surface is taken to be at least that wide, however large zeta is."""
-        probes = t0.lerp(t1, torch.linspace(0, 1, PROBES + 1, device=t0.device))  # (R,PROBES+1)
+        even = torch.linspace(0, 1, PROBES + 1, device=t0.device)
+        probes = t0.lerp(t1, even)  # (R,PROBES+1)
+        sdf = self.cache.sdf(rays.at(probes))  # (R,PROBES+1)
         zeta = self.zeta().clamp_max(self.cache.n)  # 1 / n is half a voxel
-        alpha = self.alpha(self.cache.sdf(rays.at(probes)), zeta)  # (R,PROBES)
+        alpha = self.alpha(sdf, zeta)  # (R,PROBES)
         return importance_samples(probes, alpha, stratified(rays, self.cfg.samples - 1, gen))
 
     def trace(self, rays, code, gen=None):
@@ -1191,12 +1206,14 @@ class GeoNVS(nn.Module):
 
     def phi(self, rays, hits):
         """Phi (R,) of rays with hits, 0 where a user's mask excludes the pixel. Eq. 4"""
+        is_counted = ~rays.is_masked
         e_grad, e_curv = self.cache.errors(hits.x)  # (R,)
         if self.cfg.printed("phi"):
             is_inside = hits.x[:, 0].norm(dim=1) < 1.001  # not if a ray misses the sphere
             e_curv = e_curv / self.cache.side  # as printed: |lap s| without h
-            return paper_phi(complexity(e_grad, e_curv) * is_inside) * ~rays.is_masked
-        return edge_indicator(complexity(e_grad, e_curv), hits.opacity.detach() * ~rays.is_masked)
+            ray_complexity = complexity(e_grad, e_curv) * is_inside
+            return paper_phi(ray_complexity) * is_counted
+        return edge_indicator(complexity(e_grad, e_curv), hits.opacity.detach() * is_counted)
 
     def transients(self, rays, photos, place, phi, error, done):
         """Section 6 for rays that end at places (R,3), with Phi and errors (R,). Returns left_out
@@ -1268,7 +1285,8 @@ class GeoNVS(nn.Module):
         for name in ("exp_avg", "exp_avg_sq"):
             state[name] = carry_over_rows(state[name], is_old)
         optimizer.state[octree.features] = state
-        optimizer.param_groups[1]["params"] = [tree.features for tree in self.octrees]  # the grids
+        _, grids, _, _ = optimizer.param_groups
+        grids["params"] = [tree.features for tree in self.octrees]
 
     def codes(self):
         """Appearance codes (I,A) of all photos."""
@@ -1319,7 +1337,9 @@ class State:
 
     def share_done(self, cfg):
         """Share of training that is done, of steps or minutes; 1 or more: it is over."""
-        return self.seconds / (60 * cfg.minutes) if cfg.minutes > 0 else self.step / cfg.steps
+        if cfg.minutes > 0:
+            return self.seconds / (60 * cfg.minutes)
+        return self.step / cfg.steps
 
 
 def make_optimizer(model):
@@ -1338,9 +1358,10 @@ def training_step(model, optimizer, step, done, gen, processes=ALONE):
     optimizer.zero_grad()
     loss.backward()
     processes.average_gradients(model)
-    rate = min(1, (step + 1) / 20) * (0.525 + 0.475 * math.cos(math.pi * done))
+    warm_up = min(1, (step + 1) / 20)
+    decay = 0.525 + 0.475 * math.cos(math.pi * done)
     for group in optimizer.param_groups:
-        group["lr"] = rate * group["base_lr"]
+        group["lr"] = warm_up * decay * group["base_lr"]
     optimizer.step()
     return terms | dict(total=loss.detach())
 
@@ -1363,8 +1384,8 @@ def fingerprint(scene):
 
 
 def save(run, model, optimizer, gen, state, terms):
-    """Adds a line to the log, writes checkpoint.pt (with the log in it) and log.jsonl, prints, and
-    removes the results of a shorter training. terms: the step's losses."""
+    """Adds a line to the log, writes checkpoint.pt (with the log in it) and log.jsonl, and prints.
+    terms: the step's losses."""
     line = dict(step=state.step, seconds=state.seconds, joules=state.joules)
     line |= {key: value.item() for key, value in terms.items()}
     line["psnr"] = -10 * math.log10(line["mse"] + 1e-10)  # of the step's rays, people included
@@ -1374,18 +1395,19 @@ def save(run, model, optimizer, gen, state, terms):
           "--resume, or train beside it by --name NAME")
     state.log.append(json.dumps(line) + "\n")
     saved = dict(
-        config=vars(model.cfg), state=vars(state), scene=fingerprint(model.scene),
-        model=model.state_dict(), optimizer=optimizer.state_dict(), generator=gen.get_state(),
-        octrees=[octree.split_keys.clone() for octree in model.octrees])
+        config=vars(model.cfg),
+        scene=fingerprint(model.scene),
+        octrees=[octree.split_keys.clone() for octree in model.octrees],
+        model=model.state_dict(),
+        optimizer=optimizer.state_dict(),
+        generator=gen.get_state(),
+        state=vars(state))
     buffer = io.BytesIO()  # as torch.save calls a full disk a RuntimeError
     torch.save(saved, buffer)
     atomic_write(run / "checkpoint.pt", lambda part: part.write_bytes(buffer.getbuffer()))
     atomic_write(log, lambda part: part.write_text("".join(state.log)))
     done = min(1, state.share_done(model.cfg))
     print(f"  {done:4.0%}  step {state.step}  psnr {line['psnr']:.2f}", flush=True)
-    for name in ("metrics.json", "codes.npy", "panel.png", "mesh.ply", "film.mp4"):
-        (run / name).unlink(missing_ok=True)
-    shutil.rmtree(run / "held_out", ignore_errors=True)
 
 
 def read_checkpoint(path, given):
@@ -1463,6 +1485,13 @@ def check_finite(tensors, cfg):
           "rates --lr_grid and --lr_net; an older checkpoint.pt, if any, is still there")
 
 
+def remove_results(run):
+    """Removes what a finished run wrote."""
+    for name in ("metrics.json", "codes.npy", "panel.png", "mesh.ply", "film.mp4"):
+        (run / name).unlink(missing_ok=True)
+    shutil.rmtree(run / "held_out", ignore_errors=True)
+
+
 def start(cfg, scene, saved=None, processes=ALONE):
     """Model, optimiser, generator and State: new ones, or those of a checkpoint, `saved`."""
     torch.manual_seed(cfg.seed)
@@ -1521,6 +1550,7 @@ def train(cfg, scene, run, saved=None, processes=ALONE):
                 if processes.rank == 0:
                     state.joules = next(meter, None)  # None, never 0, once a counter has failed
                     save(run, model, optimizer, gen, state, terms)
+                    remove_results(run)  # of a shorter training
     if caught or is_stopped:
         raise KeyboardInterrupt(
             f"stopped; step {state.step} is saved, and the same command with --resume goes on")
@@ -1661,7 +1691,8 @@ def extract_mesh(model):
     surface; elsewhere the cache gives its sign."""
     n = min(round(2 / model.eps), 512)
     cache = model.cache
-    volume = F.interpolate(cache.volume[:, :1], n + 1, mode="trilinear", align_corners=True)[0, 0]
+    s = cache.volume[:, :1]
+    volume = F.interpolate(s, n + 1, mode="trilinear", align_corners=True)[0, 0]
     square = torch.linspace(-1, 1, n + 1, device=volume.device) ** 2
     square = square[:, None, None] + square[:, None] + square  # (n+1,n+1,n+1) squared radius
     is_close = (square < 1.1) & (volume.abs() < 3 * cache.side)
@@ -1683,7 +1714,8 @@ def mesh_colors(model, vertices):
 
     def colors(x):
         _, geo = model.sdf(x)  # (P,G)
-        normal = F.normalize(model.sdf.derivatives(x, model.eps)[1])
+        _, grad, _ = model.sdf.derivatives(x, model.eps)
+        normal = F.normalize(grad)
         per_ray = torch.cat([normal, -normal, mean.expand(len(x), -1)], 1)  # (P,3+3+A)
         return colors_of(model.color, geo[:, None], per_ray)[:, 0]
     x = (vertices - scene.raw["center"]) / scene.raw["scale"]
@@ -1793,7 +1825,10 @@ def finish(model, scene, state, run, processes=ALONE):
     buffers = [tensor for octree in model.octrees for tensor in octree.buffers()]
     fitted = "appearance fitted on the left half, " if model.codes().numel() else ""
     metrics = dict(
-        scene=scene.info["scene"], method=model.name, seed=cfg.seed, steps=state.step,
+        scene=scene.info["scene"],
+        method=model.name,
+        seed=cfg.seed,
+        steps=state.step,
         device=torch.cuda.get_device_name() if is_cuda else threads,
         train_seconds=state.seconds,
         energy_wh=state.joules / 3600 if is_metered else None,
@@ -1804,7 +1839,10 @@ def finish(model, scene, state, run, processes=ALONE):
         octree_cells=model.sdf.octree.cells[:, 0].bincount().tolist(),  # by level
         peak_memory_bytes=peak_memory(is_cuda),  # up to here: not of scoring
         protocol=fitted + "scored on the right half",
-        has_mask=model.has_mask, torch=torch.__version__, commit=code_version(), config=vars(cfg))
+        has_mask=model.has_mask,
+        torch=torch.__version__,
+        commit=code_version(),
+        config=vars(cfg))
     pictures = {}
     scores, codes = evaluate(model, scene, make_lpips(), pictures)
     metrics |= scores
@@ -1844,8 +1882,11 @@ def make_parser():
             group = parser.add_argument_group(GROUPS[option.name])
         alone = option.metadata.get("alone")
         group.add_argument(
-            f"--{option.name}", type=option.type, metavar=option.type.__name__.upper(),
-            nargs="?" if alone else None, const=alone,
+            f"--{option.name}",
+            type=option.type,
+            nargs="?" if alone else None,
+            const=alone,
+            metavar=option.type.__name__.upper(),
             default=argparse.SUPPRESS,  # for make_config, which has to know what was given
             help=f"{option.metadata['meaning']} [{option.default}]".removesuffix(" []"))
     return parser
