@@ -144,8 +144,8 @@ class Config:
     lam_mask: float = setting(1.0, "L_reg, which trains the mask [D3]")
     lam_gpl: float = setting(0.05, "L_GPL, geometry preservation")
     lam_lps: float = setting(3e-6, "L_lps, Lipschitz bound (as Permuto-SDF)")
-    lam_sfm: float = setting(7.5e-3, "min(zeta, 40) |s(p)| at SfM points [D5]")
-    lam_off: float = setting(0.03, "min(zeta, 40) L_off, off-surface [D5]")
+    lam_sfm: float = setting(0.3, "L_sfm, |s| at SfM points [D5]")
+    lam_off: float = setting(1.2, "L_off, off-surface [D5]")
     lr_grid: float = setting(1e-2, "octree features")
     lr_code: float = setting(3e-2, "appearance codes")
     lr_net: float = setting(4e-3, "networks")
@@ -465,8 +465,9 @@ class Octree(nn.Module):
             index = (2 * parents[:, None] + octants).flatten(0, 1)  # by parent, then octant
         cells = torch.cat(cells)
         is_split = torch.isin(pack_index(cells), split_keys)  # (N,)
-        # level 0 has root^3 rows; children of split cell n (from 0) begin at row root^3 + 8 n
-        child = (self.root**3 + 8 * (is_split.cumsum(0) - 1)).int() * is_split  # (N,)
+        # a cell that is not split stands for its children: only rows of children exceed its own
+        child = torch.arange(len(cells), device=cells.device)[:, None].repeat(1, 8)  # (N,8)
+        child[is_split] = torch.arange(self.root**3, len(cells), device=cells.device).view(-1, 8)
         # a corner is its cell's index plus an octant; the key of a sum is the sum of the keys
         corners = pack_index(cells)[:, None] + pack_index(octants)  # (N,8)
         key, corner, cells_around = corners.unique(return_inverse=True, return_counts=True)  # (.,)
@@ -481,7 +482,7 @@ class Octree(nn.Module):
         self.corner_key = nn.Buffer(key, persistent=False)  # (V,) sorted, the corner of each row
         self.features = nn.Parameter(carry_over_rows(self.features, is_old))
         self.cells = nn.Buffer(cells, persistent=False)  # (N,4) level, i, j, k
-        self.child = nn.Buffer(child, persistent=False)  # (N,) row of the first child, 0: none
+        self.child = nn.Buffer(child.int(), persistent=False)  # (N,8) rows of children, or its own
         self.corner = nn.Buffer(row[corner].int(), persistent=False)  # (N,8) rows of features
         self.is_hanging = nn.Buffer(~has_feature[corner], persistent=False)  # (N,8)
         # (N,3) sums over rays that hit a cell: of errors, of pixel sizes there, their number
@@ -501,14 +502,12 @@ class Octree(nn.Module):
         octants = pack_index(index & 1, base=2)  # (P,L)
         node = pack_index(index[:, 0], base=self.root)  # (P,) of level 0
         nodes = [node]
-        exists = [torch.ones_like(node, dtype=torch.bool)]
         for octant in octants[:, 1:].unbind(1):  # (P,) of the levels after it
-            child = self.child[node]  # (P,)
-            has_child = child > 0
-            node = torch.where(has_child, child + octant, node)
+            node = self.child[node, octant]
             nodes.append(node)
-            exists.append(has_child)
-        return torch.stack(nodes, 1), torch.stack(exists, 1), x.frac()
+        node = torch.stack(nodes, 1)  # (P,L)
+        exists = F.pad(node.diff() > 0, (1, 0), value=True)  # (P,L)
+        return node, exists, x.frac()
 
     def forward(self, x):
         """Features (...,LC) at x (...,3)."""
@@ -672,7 +671,6 @@ def lipschitz_loss(network):
 # ---- 5 From SDF to colour: alpha, compositing, samples, background -------------------------------
 
 PROBES = 64  # even intervals of a ray at whose ends the cache is looked up, to place samples
-UNIFORM_SHARE = 0.25  # ratio of uniform to importance weight, so that a lost surface can return
 
 
 def neus_alpha(sdf, zeta):
@@ -727,9 +725,7 @@ def importance_samples(probes, alpha, u):
     the stratified numbers u (R,S-1). They are dense where the intervals between probes, of opacity
     alpha (R,J), have weight."""
     weight = composite(alpha)
-    uniform_weight = UNIFORM_SHARE * weight.mean(1, keepdim=True)
-    weight = weight + uniform_weight + 1e-5  # an empty ray has uniform samples
-    inner = inverse_cdf(probes, weight, u)
+    inner = inverse_cdf(probes, weight + 1e-5, u)  # an empty ray has uniform samples
     return torch.cat([probes[:, :1], inner, probes[:, -1:]], 1)
 
 
@@ -943,18 +939,16 @@ class UsualErrors(nn.Module):
         return (PLACE_FACTOR * self.quantile[self.cell(place)]).clamp_min(MIN_THRESHOLD)
 
     def update(self, place, error, is_chosen):
-        """Moves the quantiles of places (R,3), given errors (R,) of rays. Only rays with is_chosen
-        (R,) push. An error above a quantile pushes it up by PLACE_QUANTILE, one below pushes it
-        down by 1 - PLACE_QUANTILE: they balance at the quantile (the pinball loss's gradient). A
+        """Moves the quantiles of places (R,3), given errors (R,) of rays. Rays without is_chosen
+        (R,) push by 0. An error above a quantile pushes it up by PLACE_QUANTILE, one below pushes
+        it down by 1 - PLACE_QUANTILE: they balance at the quantile (the pinball loss's gradient). A
         step multiplies the quantile by exp(QUANTILE_RATE times the mean push)."""
         cell = self.cell(place)
         is_below = error < self.quantile[cell]
-        push = torch.where(is_below, PLACE_QUANTILE - 1, PLACE_QUANTILE)
-        count = len(self.quantile)
-        mean = push.new_zeros(count + 1)  # the last one is of rays that do not count
-        cell = torch.where(is_chosen, cell, count)
+        push = is_chosen * torch.where(is_below, PLACE_QUANTILE - 1, PLACE_QUANTILE)
+        mean = torch.zeros_like(self.quantile)
         mean.scatter_reduce_(0, cell, push, "mean", include_self=False)
-        self.quantile *= torch.exp(QUANTILE_RATE * mean[:count])
+        self.quantile *= torch.exp(QUANTILE_RATE * mean)
         self.quantile.clamp_min_(1e-6)  # as no factor leads away from 0
 
 
@@ -1021,7 +1015,6 @@ class TransientMask(nn.Module):
 
 START_ZETA = 20  # a surface is 1/20 of a radius wide
 LEAST_ZETA = 80  # from ZETA_RISE of training on
-MAX_PULL = 40  # zeta up to which L_sfm and L_off grow stronger
 CACHE_EVERY = 128  # steps between renewals of the cache
 
 
@@ -1102,17 +1095,18 @@ class GeoNVS(nn.Module):
         return self.sdf.octree.finest / 2
 
     def zeta(self):
-        """The deviation network: one learned number v, zeta = exp(10 v), clipped as in NeuS's code;
-        1 / zeta is the width of a surface."""
-        return torch.exp((10 * self.deviation).clamp(-13.8, 13.8))
+        """The deviation network: one learned number v, zeta = exp(10 v) (NeuS). 1 / zeta is the
+        width of a surface."""
+        return torch.exp(10 * self.deviation)
 
-    def raise_zeta(self, done):
-        """Keeps zeta above a bound that rises with training (done: 0..1). A soft surface can paint
-        people and clouds of a single photo. Their errors are then small, so the mask misses them,
-        and the surface stays soft. [D8]"""
+    def bound_zeta(self, done):
+        """Keeps zeta between 1e-6 and 1e6 (NeuS's code), and above a bound that rises with training
+        (done: 0..1). A soft surface can paint people and clouds of a single photo. Their errors are
+        then small, so the mask misses them, and the surface stays soft. [D8]"""
+        least = 1e-6
         if not self.cfg.printed("zeta"):
-            least = LEAST_ZETA * min(done / ZETA_RISE, 1) + 1e-6  # 0 has no logarithm
-            self.deviation.data.clamp_min_(math.log(least) / 10)
+            least += LEAST_ZETA * min(done / ZETA_RISE, 1)
+        self.deviation.data.clamp_(math.log(least) / 10, math.log(1e6) / 10)
 
     def alpha(self, sdf, zeta):
         """Opacity (R,S) of the intervals between samples with SDF (R,S+1). Eq. 1"""
@@ -1186,8 +1180,6 @@ class GeoNVS(nn.Module):
         error = residual.detach().amax(1)  # (R,) of the worst channel
         phi = self.phi(rays, hits)  # (R,)
         left_out, reg, gpl = self.transients(rays, photos, hits.place, phi, error, done)
-        # zeta |s| is s in widths of the surface; at first s must be free to change [D5]
-        pull = self.zeta().detach().clamp_max(MAX_PULL)
         _, s_sfm, s_air = s.split([R, n, n])
         # at a segment's end s is at most AIR_GAP, as the SfM point is that near
         margin = min(self.sdf.octree.finest, AIR_GAP)
@@ -1198,8 +1190,8 @@ class GeoNVS(nn.Module):
             reg=reg,
             gpl=gpl,
             lps=lipschitz_loss(self.color),
-            off=pull * off_surface_loss(s_air, margin),  # [D5]
-            sfm=pull * s_sfm.abs().mean())  # [D5]
+            off=off_surface_loss(s_air, margin),  # [D5]
+            sfm=s_sfm.abs().mean())  # [D5]
         self.update_statistics(rays, hits, error)
         log = loss | dict(mse=residual.square().mean(), left_out=left_out.mean())
         return objective(loss, self.cfg), log
@@ -1352,7 +1344,7 @@ def training_step(model, optimizer, step, done, gen, processes=ALONE):
     share of training, 0..1. Returns GeoNVS.losses' log and total. Never waits for the device."""
     if step % CACHE_EVERY == 0:
         model.refresh_cache()
-    model.raise_zeta(done)
+    model.bound_zeta(done)
     rays, photos = model.batch(model.cfg.rays, gen)
     loss, terms = model.losses(rays, photos, done, gen)
     optimizer.zero_grad()
