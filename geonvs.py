@@ -362,7 +362,7 @@ def air_segments(scene):
 # ---- 3 Octree: features on the corners of cells --------------------------------------------------
 
 ROOT = 16  # cells of the coarsest level along an axis
-MAX_CELLS = 8_000_000  # of the foreground: about 1 GB with Adam's moments, more while refining
+MAX_CELLS = 8_000_000  # of the foreground: 1.2 GB with Adam's moments, more while refining
 SPLIT_SHARE = 0.5  # a refinement splits the worst cells, which hold this share of the error
 
 
@@ -506,7 +506,7 @@ class Octree(nn.Module):
             node = self.child[node, octant]
             nodes.append(node)
         node = torch.stack(nodes, 1)  # (P,L)
-        exists = F.pad(node.diff() > 0, (1, 0), value=True)  # (P,L)
+        exists = F.pad(node.diff() > 0, (1, 0), value=True)  # (P,L) level 0 always does
         return node, exists, x.frac()
 
     def forward(self, x):
@@ -938,14 +938,14 @@ class UsualErrors(nn.Module):
         """The error (R,) above which rays that end at places (R,3) are transient."""
         return (PLACE_FACTOR * self.quantile[self.cell(place)]).clamp_min(MIN_THRESHOLD)
 
-    def update(self, place, error, is_chosen):
-        """Moves the quantiles of places (R,3), given errors (R,) of rays. Rays without is_chosen
+    def update(self, place, error, is_counted):
+        """Moves the quantiles of places (R,3), given errors (R,) of rays. Rays without is_counted
         (R,) push by 0. An error above a quantile pushes it up by PLACE_QUANTILE, one below pushes
         it down by 1 - PLACE_QUANTILE: they balance at the quantile (the pinball loss's gradient). A
         step multiplies the quantile by exp(QUANTILE_RATE times the mean push)."""
         cell = self.cell(place)
         is_below = error < self.quantile[cell]
-        push = is_chosen * torch.where(is_below, PLACE_QUANTILE - 1, PLACE_QUANTILE)
+        push = is_counted * torch.where(is_below, PLACE_QUANTILE - 1, PLACE_QUANTILE)
         mean = torch.zeros_like(self.quantile)
         mean.scatter_reduce_(0, cell, push, "mean", include_self=False)
         self.quantile *= torch.exp(QUANTILE_RATE * mean)

@@ -1763,8 +1763,8 @@ def plain_losses(model, rays, done):
         terms["eik"] += opacity * (slopes[r].norm() - 1) ** 2 / 12
         terms["curv"] += opacity * laps[r].abs() * model.eps / 8
         terms["left_out"] += left_out / 8
-        if not is_masked:
-            pushes[places[r]].append(-0.8 if error < usual else 0.2)
+        push = -0.8 if error < usual else 0.2
+        pushes[places[r]].append(0 if is_masked else push)
         if opacity > 0.5:
             pixel = hits.depth[r] / model.scene.K[rays.photo[r], 0]
             cell_error[nodes[r, -1]] += torch.tensor([0 if is_masked else error, pixel, 1])
