@@ -1788,7 +1788,9 @@ def test_the_objective_and_its_gradients_equal_plain_loops(double, mask, zeta, d
     model, rays, photos = rough_case(mask=mask, lam_gpl=0.4, lam_mask=0.7, paper=paper)
     model.deviation.data.fill_(math.log(zeta) / 10)
     model.usual_errors.quantile.uniform_(0, 0.4)
-    model.air = random(*model.air.shape, low=-0.2, high=0.2)  # inside the ball: L_off counts
+    # in the ball, where s < 0: L_off counts, and L_sfm needs the absolute value
+    model.air = random(*model.air.shape, low=-0.2, high=0.2)
+    model.sfm = random(*model.sfm.shape, low=-0.2, high=0.2)
     plain = plain_losses(model, rays, done)
     total, log = model.losses(rays, photos, done, generator())
     log |= dict(cell_error=model.sdf.octree.cell_error, quantile=model.usual_errors.quantile)
