@@ -45,11 +45,10 @@ Departures from the printed paper. The tag stands at the code; .github/RESULTS.m
   [D2]  E_curv = |lap s|; Phi on       |lap s| h, h being the step of    |lap s| grows as h shrinks;
         every ray                      the difference; L_eik, L_curv,    rays through air have no
                                        Phi are weighted by opacity       edges
-  [D3]  L_reg: penalties of            M is trained to classify rays     castle: 1.8 dB, four other
+  [D3]  L_reg: penalties of            M is trained to classify rays     castle: 2.9 dB, four other
         intensity and bimodality of    by error, the threshold depends   sets of photos: level; what
-        M, which L_rgb trains, too     on the place; outliers are        is static errs at first,
-                                       rejected at first; M is fixed     too, and is masked for good
-                                       at 60 % of training
+        M, which L_rgb trains, too     on the place; M is fixed at       is static errs at first,
+                                       60 % of training                  too, and is masked for good
   [D4]  CGNet                          a block a stage, GroupNorm, a     photos are small, a few in
                                        head at each resolution           a batch
   [D5]  a sphere loss in a warm-up     SfM points place the sphere and   else remnants of the ball
@@ -227,7 +226,6 @@ ALONE = Processes()
 
 # when things happen, in shares of training
 REFINE_AT = (0.1, 0.2, 0.3, 0.45, 0.6)  # the octree is refined; later there is no time to fit it
-REJECTION = 0.3  # outliers are rejected until then, while the mask does not know them yet
 ZETA_RISE = 0.4  # surfaces may be soft until then: the least zeta rises
 MASK_TRAINING = 0.6  # M is fixed from then on, which is faster and costs nothing
 
@@ -912,15 +910,6 @@ def paper_mask_loss(mask, error):
     return (0.15 * mask**2 + 0.02 * mask * (1 - mask) - mask * error).mean()
 
 
-def reject_outliers(mask, is_outlier, done):
-    """M (R,), set to 1 where a ray is rejected: its error exceeds its threshold (is_outlier), and M
-    exceeds a bar. The bar starts at 0: at first every outlier is rejected. That may be structure
-    not learnt yet, but not for long: it errs in all photos, and this raises the threshold
-    (UsualErrors, below). The bar reaches 1 at REJECTION of training; then M alone decides. [D3]"""
-    bar = (done / REJECTION) ** 2  # squared: it rises late
-    return mask.masked_fill(is_outlier & (mask > bar), 1)
-
-
 class UsualErrors(nn.Module):
     """For each place of contracted space a low quantile of the errors of all rays that end there.
     A place that is bad in all photos is the model's fault. One that is bad in one photo shows a
@@ -1209,8 +1198,8 @@ class GeoNVS(nn.Module):
 
     def transients(self, rays, photos, place, phi, error, done):
         """Section 6 for rays that end at places (R,3), with Phi and errors (R,). Returns left_out
-        (R,), L_reg and L_GPL. L_rgb is weighted by 1 - left_out. left_out is M, or 1 for rejected
-        outliers and for pixels that a user's mask excludes."""
+        (R,), L_reg and L_GPL. L_rgb is weighted by 1 - left_out, which does not train M. left_out
+        is M, or 1 where a user's mask excludes the pixel."""
         if not self.has_mask:
             return rays.is_masked.float(), *error.new_zeros(2)
         with torch.set_grad_enabled(done < MASK_TRAINING):
@@ -1219,13 +1208,12 @@ class GeoNVS(nn.Module):
         # SfM pixels count as if they had no error: they train M = 0 [D5]
         judged = error.masked_fill(rays.has_sfm, 0)
         if self.cfg.printed("reg"):
-            reg = paper_mask_loss(M * ~rays.is_masked, judged)  # it trains M in L_rgb's place
-            left_out = M.detach()
+            reg = paper_mask_loss(M * ~rays.is_masked, judged)
         else:
             excess = judged - self.usual_errors.threshold(place)
             reg = mask_loss(logit, excess * ~rays.is_masked)
-            left_out = reject_outliers(M.detach(), excess > 0, done)
-        return left_out.masked_fill(rays.is_masked, 1), reg, gpl_loss(M, phi)
+        left_out = M.detach().masked_fill(rays.is_masked, 1)
+        return left_out, reg, gpl_loss(M, phi)
 
     def update_statistics(self, rays, hits, error):
         """Records the errors (R,) of a step's rays twice: by place, for the mask's threshold [D3],

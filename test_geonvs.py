@@ -1750,12 +1750,10 @@ def plain_losses(model, rays, done):
             M = logit.sigmoid()
             judged = 0.0 if has_sfm else error
             excess = judged - max(0.15, 1.5 * usual)
-            is_rejected = excess > 0 and M > (done / 0.3) ** 2
             reg = -abs(excess) * F.logsigmoid(logit if excess > 0 else -logit)
             if model.cfg.printed("reg"):
-                is_rejected = False
                 reg = 0.15 * M**2 + 0.02 * M * (1 - M) - M * judged
-            left_out = 1.0 if is_rejected or is_masked else M.item()
+            left_out = 1.0 if is_masked else M.item()
         terms["mse"] += residual.square().mean() / 8
         terms["rgb"] += (1 - left_out) * residual.mean() / 8
         terms["reg"] += reg * (not is_masked) / 8
@@ -3159,14 +3157,6 @@ class NoNormal(geonvs.GeoNVS):
         return super().shade(rays, code, hits, torch.zeros_like(normal))
 
 
-class NoRejection(geonvs.GeoNVS):
-    """Outliers are never rejected."""
-
-    def transients(self, rays, photos, place, phi, error, done):
-        done = max(done, geonvs.REJECTION)
-        return super().transients(rays, photos, place, phi, error, done)
-
-
 class UniformGrid(geonvs.GeoNVS):
     """Every cell of the foreground is split, down to the last level."""
     name = "uniform grid"
@@ -3221,7 +3211,6 @@ PARTS = {
     "no background": Row(dict(background="off")),
     "no normal as an input": Row(kind=NoNormal),
     "no threshold by place": Row(constants=dict(PLACE_FACTOR=0.0)),
-    "no early rejection": Row(kind=NoRejection),
     "density": METHODS["density"]}
 GRID = {"octree": Row(), "uniform grid": Row(kind=UniformGrid)}
 STRESS = {  # knobs of a toy, and the row of PARTS without what is made for it
