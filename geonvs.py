@@ -45,10 +45,9 @@ Departures from the printed paper. The tag stands at the code; .github/RESULTS.m
   [D2]  E_curv = |lap s|; Phi on       |lap s| h, h being the step of    |lap s| grows as h shrinks;
         every ray                      the difference; L_eik, L_curv,    rays through air have no
                                        Phi are weighted by opacity       edges
-  [D3]  L_reg: penalties of            M is trained to classify rays     castle: 2.9 dB, four other
-        intensity and bimodality of    by error, the threshold depends   sets of photos: level; what
-        M, which L_rgb trains, too     on the place; M is fixed at       is static errs at first,
-                                       60 % of training                  too, and is masked for good
+  [D3]  L_reg: penalties of            M is trained to classify rays     castle: 3.2 dB, four other
+        intensity and bimodality of    by error; M is fixed at 60 %      sets of photos: level
+        M, which L_rgb trains, too     of training
   [D4]  CGNet                          a block a stage, GroupNorm, a     photos are small, a few in
                                        head at each resolution           a batch
   [D5]  a sphere loss in a warm-up     SfM points place the sphere and   else remnants of the ball
@@ -183,10 +182,10 @@ GPU_DEFAULTS = dict(steps=75_000, rays=16_384, photos=16, samples=32, appearance
 
 @dataclass
 class Processes:
-    """The processes that torchrun started, or this one alone. Each draws its own rays and keeps its
-    own error quantiles (UsualErrors). Gradients are averaged, so all hold the same weights. Rank 0
-    decides, prints and saves. One process on a CPU resumes bit for bit. A GPU adds floats in any
-    order, and of several processes only the first keeps its random numbers."""
+    """The processes that torchrun started, or this one alone. Each draws its own rays. Gradients are
+    averaged, so all hold the same weights. Rank 0 decides, prints and saves. One process on a CPU
+    resumes bit for bit. A GPU adds floats in any order, and of several processes only the first
+    keeps its random numbers."""
     count: int = 1
     rank: int = 0
     local_rank: int = 0  # on this machine: the number of the process's GPU
@@ -790,8 +789,7 @@ class Background(nn.Module):
     def forward(self, rays, t0, t1, code, gen=None):
         """What rays see around the sphere, which they enter at t0 (R,1) and leave at t1, under
         codes (R,A). Returns the colour (R,3) of what lies before the sphere and the share (R,1) of
-        light that passes it; the colour (R,3) beyond the sphere, already dimmed by that share; the
-        mean position (R,3) there, in contracted space, without gradient."""
+        light that passes it; the colour (R,3) beyond the sphere, already dimmed by that share."""
         n = self.samples // 6  # samples before the sphere; little stands before a landmark
         near = rays.near.lerp(t0, stratified(rays, n, gen))  # (R,n)
         u = stratified(rays, self.samples - n, gen)  # (R,K-n)
@@ -810,9 +808,7 @@ class Background(nn.Module):
         near_color = colors[:, :n].sum(1)  # (R,3)
         far_color = colors[:, n:].sum(1)  # (R,3)
         near_trans = 1 - w[:, :n].sum(1, keepdim=True)  # (R,1)
-        far_w = F.normalize(w[:, n:].detach(), p=1, dim=1)
-        place = torch.einsum("rk,rkc->rc", far_w, x[:, n:])
-        return near_color, near_trans, far_color, place
+        return near_color, near_trans, far_color
 
 
 def surface_depth(t, sdf, w):
@@ -829,7 +825,7 @@ def surface_depth(t, sdf, w):
 
 
 class Hits(NamedTuple):
-    """What rays meet, indexed by the ray. depth, point and place have no gradient."""
+    """What rays meet, indexed by the ray. depth and point have no gradient."""
     x: Tensor  # (R,S+1,3) samples in the sphere
     geo: Tensor  # (R,S+1,G) inputs of the colour network there
     w: Tensor  # (R,S+1) their weights, dimmed by what lies before the sphere
@@ -837,7 +833,6 @@ class Hits(NamedTuple):
     depth: Tensor  # (R,) distance to the surface; t1 if none is met
     point: Tensor  # (R,3) the surface point
     around: Tensor  # (R,3) colour that the background adds, before and beyond the sphere
-    place: Tensor  # (R,3) where the ray ends, in contracted space: point, or the background's place
 
 
 class Rendering(NamedTuple):
@@ -853,11 +848,7 @@ class Rendering(NamedTuple):
 # the paper's values for Eq. 4; the lambda_curv of its Eq. 5 is cfg.lam_curv here: with a value of
 # 2, L_curv would outweigh L_rgb [D2]
 LAMBDA_GRAD, LAMBDA_CURV = 10.0, 2.0
-MIN_THRESHOLD = 0.15  # no smaller error makes a pixel transient
-PLACE_CELLS = 32  # along an axis, of the table of errors over contracted space
-PLACE_QUANTILE = 0.2  # of the errors at a place in all photos; low, so that people hardly raise it
-PLACE_FACTOR = 1.5  # an error up to so many times that quantile is usual for the place
-QUANTILE_RATE = 0.1  # a push of 1 moves the logarithm of a quantile by this
+THRESHOLD = 0.15  # a greater error of a pixel's worst channel makes it transient
 
 
 def complexity(e_grad, e_curv):
@@ -908,37 +899,6 @@ def paper_mask_loss(mask, error):
     nor weights: the forms are CR-NeRF's, the weights 0.15 and 0.02 ours. The best M of a ray is
     (error - 0.02) / 0.26. L_GPL subtracts 0.05 Phi from the error: it lowers M by at most 0.19."""
     return (0.15 * mask**2 + 0.02 * mask * (1 - mask) - mask * error).mean()
-
-
-class UsualErrors(nn.Module):
-    """For each place of contracted space a low quantile of the errors of all rays that end there.
-    A place that is bad in all photos is the model's fault. One that is bad in one photo shows a
-    tourist. [D3]"""
-    def __init__(self):
-        super().__init__()
-        self.quantile = nn.Buffer(torch.full((PLACE_CELLS**3,), 0.1))  # a first guess
-
-    def cell(self, place):
-        """Index (R,) into the table of places (R,3)."""
-        index = ((place + 2) * (PLACE_CELLS / 4)).long()  # the space is 4 wide
-        return pack_index(index.clamp(0, PLACE_CELLS - 1), base=PLACE_CELLS)
-
-    def threshold(self, place):
-        """The error (R,) above which rays that end at places (R,3) are transient."""
-        return (PLACE_FACTOR * self.quantile[self.cell(place)]).clamp_min(MIN_THRESHOLD)
-
-    def update(self, place, error, is_counted):
-        """Moves the quantiles of places (R,3), given errors (R,) of rays. Rays without is_counted
-        (R,) push by 0. An error above a quantile pushes it up by PLACE_QUANTILE, one below pushes
-        it down by 1 - PLACE_QUANTILE: they balance at the quantile (the pinball loss's gradient). A
-        step multiplies the quantile by exp(QUANTILE_RATE times the mean push)."""
-        cell = self.cell(place)
-        is_below = error < self.quantile[cell]
-        push = is_counted * torch.where(is_below, PLACE_QUANTILE - 1, PLACE_QUANTILE)
-        mean = torch.zeros_like(self.quantile)
-        mean.scatter_reduce_(0, cell, push, "mean", include_self=False)
-        self.quantile *= torch.exp(QUANTILE_RATE * mean)
-        self.quantile.clamp_min_(1e-6)  # as no factor leads away from 0
 
 
 def conv(inputs, outputs, stride):
@@ -1073,7 +1033,6 @@ class GeoNVS(nn.Module):
             self.octrees.append(self.background.octree)
         self.deviation = nn.Parameter(torch.tensor(math.log(START_ZETA) / 10))
         self.mask = TransientMask(scene.thumbs) if self.has_mask else None
-        self.usual_errors = UsualErrors()
         self.cache = SDFCache(64 if levels < 4 else 128)  # as fine as the octree, within bounds
         self.refresh_cache()
         print(f"  octree levels: {levels}, appearance code: {A}, octrees: {len(self.octrees)}")
@@ -1134,13 +1093,11 @@ class GeoNVS(nn.Module):
 
         near_color = 0  # nothing stands before the sphere
         far_color = self.bg_color  # (3,)
-        far_place = 2 * rays.d  # (R,3) infinity
         if self.background:
-            near_color, near_trans, far_color, far_place = self.background(rays, t0, t1, code, gen)
+            near_color, near_trans, far_color = self.background(rays, t0, t1, code, gen)
             w = near_trans * w
         around = near_color + (1 - opacity[:, None]) * far_color  # (R,3)
-        place = torch.where(opacity[:, None] > 0.5, point, far_place)
-        return Hits(x, geo, w, opacity, depth, point, around, place)
+        return Hits(x, geo, w, opacity, depth, point, around)
 
     def shade(self, rays, code, hits, normal):
         """Colours (R,3) of rays with hits and normals (R,3) at their surface points. All samples of
@@ -1168,7 +1125,7 @@ class GeoNVS(nn.Module):
         residual = (rgb - rays.rgb).abs()  # (R,3)
         error = residual.detach().amax(1)  # (R,) of the worst channel
         phi = self.phi(rays, hits)  # (R,)
-        left_out, reg, gpl = self.transients(rays, photos, hits.place, phi, error, done)
+        left_out, reg, gpl = self.transients(rays, photos, phi, error, done)
         _, s_sfm, s_air = s.split([R, n, n])
         # at a segment's end s is at most AIR_GAP, as the SfM point is that near
         margin = min(self.sdf.octree.finest, AIR_GAP)
@@ -1196,10 +1153,10 @@ class GeoNVS(nn.Module):
             return paper_phi(ray_complexity) * is_counted
         return edge_indicator(complexity(e_grad, e_curv), hits.opacity.detach() * is_counted)
 
-    def transients(self, rays, photos, place, phi, error, done):
-        """Section 6 for rays that end at places (R,3), with Phi and errors (R,). Returns left_out
-        (R,), L_reg and L_GPL. L_rgb is weighted by 1 - left_out, which does not train M. left_out
-        is M, or 1 where a user's mask excludes the pixel."""
+    def transients(self, rays, photos, phi, error, done):
+        """Section 6 for rays with Phi and errors (R,). Returns left_out (R,), L_reg and L_GPL. L_rgb
+        is weighted by 1 - left_out, which does not train M. left_out is M, or 1 where a user's mask
+        excludes the pixel."""
         if not self.has_mask:
             return rays.is_masked.float(), *error.new_zeros(2)
         with torch.set_grad_enabled(done < MASK_TRAINING):
@@ -1210,16 +1167,15 @@ class GeoNVS(nn.Module):
         if self.cfg.printed("reg"):
             reg = paper_mask_loss(M * ~rays.is_masked, judged)
         else:
-            excess = judged - self.usual_errors.threshold(place)
-            reg = mask_loss(logit, excess * ~rays.is_masked)
+            excess = (judged - THRESHOLD) * ~rays.is_masked
+            reg = mask_loss(logit, excess)
         left_out = M.detach().masked_fill(rays.is_masked, 1)
         return left_out, reg, gpl_loss(M, phi)
 
     def update_statistics(self, rays, hits, error):
-        """Records the errors (R,) of a step's rays twice: by place, for the mask's threshold [D3],
-        and by the octree's cell at the surface point, for refinement [D7]. M plays no part, so
-        people's errors are recorded, too; those of pixels that a user's mask excludes are not."""
-        self.usual_errors.update(hits.place, error, ~rays.is_masked)
+        """Records the errors (R,) of a step's rays by the octree's cell at the surface point, for
+        refinement. M plays no part, so people's errors are recorded, too; those of pixels that a
+        user's mask excludes are not. [D7]"""
         is_solid = hits.opacity > 0.5  # (R,)
         pixel = hits.depth / self.scene.K[rays.photo, 0]  # (R,) its size at the surface point
         counted = error.masked_fill(rays.is_masked, 0)

@@ -1565,8 +1565,7 @@ def plain_background(model, o, d, t0, t1, near, per_ray, before, beyond):
     color = model.background.color(inputs).sigmoid()
     alphas = 1 - torch.exp(-F.softplus(out[:-1, 0] - 1) * (ends - t[:-1]))
     w = plain_weights([*alphas, 1])
-    far = w[n:].detach()
-    return w[:n] @ color[:n], 1 - w[:n].sum(), w[n:] @ color[n:], far @ x[n:] / far.sum()
+    return w[:n] @ color[:n], 1 - w[:n].sum(), w[n:] @ color[n:]
 
 
 def plain_render(model, o, d, near, t, code, *parts):
@@ -1594,13 +1593,12 @@ def plain_render(model, o, d, near, t, code, *parts):
     inputs = torch.hstack([out[:, 1:], features, per_ray.expand(len(t), -1)])
     colors = model.color(inputs).sigmoid()
     rgb = w @ (colors[:-1] + colors[1:]) / 2
-    before, passed, beyond, bg_place = 0, 1, model.bg_color, 2 * d
+    before, passed, beyond = 0, 1, model.bg_color
     if model.background:
-        before, passed, beyond, bg_place = plain_background(
+        before, passed, beyond = plain_background(
             model, o, d, t[0], t[-1], near, per_ray[3:], *parts)
     rgb = before + passed * rgb + (1 - opacity) * beyond
-    place = point if opacity > 0.5 else bg_place
-    return torch.hstack([rgb, opacity, depth, normal, point, place])
+    return torch.hstack([rgb, opacity, depth, normal, point])
 
 
 def rough_case(**changes):
@@ -1644,7 +1642,7 @@ def test_rendering_and_its_gradients_equal_plain_loops(double, background, paper
     wanted = [plain_render(model, *row) for row in rows]
     hits = model.trace(rays, code, generator())
     rgb, normal = shaded(model, rays, code, hits)
-    found = torch.column_stack([rgb, hits.opacity, hits.depth, normal, hits.point, hits.place])
+    found = torch.column_stack([rgb, hits.opacity, hits.depth, normal, hits.point])
     assert_one_function(model, found, torch.stack(wanted))
 
 
@@ -1730,18 +1728,13 @@ def plain_losses(model, rays, done):
     air = start + geonvs.uniform(gen, 2, 1) * (end - start)
     _, slopes, laps = model.sdf.derivatives(torch.cat([hits.point, sfm, air]), model.eps)
     rgb, _ = shaded(model, rays, code, hits)
-    i, j, k = ((hits.place + 2) * 8).long().unbind(1)
-    places = ((32 * i + j) * 32 + k).tolist()  # rows of the table of usual errors
     nodes, _, _ = model.sdf.octree.locate(hits.point)
     phi = plain_phi(model, rays, hits)
-    quantile = model.usual_errors.quantile.clone()
     cell_error = torch.zeros(len(model.sdf.octree.cells), 3)
-    pushes = defaultdict(list)  # of places
-    terms = defaultdict(float, quantile=quantile, cell_error=cell_error)
+    terms = defaultdict(float, cell_error=cell_error)
     for r, (is_masked, has_sfm) in enumerate(zip(rays.is_masked.tolist(), rays.has_sfm.tolist())):
         residual = (rgb[r] - rays.rgb[r]).abs()
         error = residual.max().item()
-        usual = quantile[places[r]].item()
         opacity = hits.opacity[r].item()
         M, reg, left_out = 0.0, 0.0, is_masked
         if model.mask:
@@ -1749,7 +1742,7 @@ def plain_losses(model, rays, done):
             logit = logit.detach() if done >= 0.6 else logit
             M = logit.sigmoid()
             judged = 0.0 if has_sfm else error
-            excess = judged - max(0.15, 1.5 * usual)
+            excess = judged - 0.15
             reg = -abs(excess) * F.logsigmoid(logit if excess > 0 else -logit)
             if model.cfg.printed("reg"):
                 reg = 0.15 * M**2 + 0.02 * M * (1 - M) - M * judged
@@ -1761,13 +1754,9 @@ def plain_losses(model, rays, done):
         terms["eik"] += opacity * (slopes[r].norm() - 1) ** 2 / 12
         terms["curv"] += opacity * laps[r].abs() * model.eps / 8
         terms["left_out"] += left_out / 8
-        push = -0.8 if error < usual else 0.2
-        pushes[places[r]].append(0 if is_masked else push)
         if opacity > 0.5:
             pixel = hits.depth[r] / model.scene.K[rays.photo[r], 0]
             cell_error[nodes[r, -1]] += torch.tensor([0 if is_masked else error, pixel, 1])
-    for place, values in pushes.items():
-        quantile[place] *= math.exp(0.1 * np.mean(values))
     for slope in slopes[8:]:
         terms["eik"] += (slope.norm() - 1) ** 2 / 12
     terms["lps"] = math.prod(torch.log(1 + layer.c.exp()) for layer in model.color[::2])
@@ -1785,13 +1774,12 @@ def plain_losses(model, rays, done):
 def test_the_objective_and_its_gradients_equal_plain_loops(double, mask, zeta, done, paper):
     model, rays, photos = rough_case(mask=mask, lam_gpl=0.4, lam_mask=0.7, paper=paper)
     model.deviation.data.fill_(math.log(zeta) / 10)
-    model.usual_errors.quantile.uniform_(0, 0.4)
     # in the ball, where s < 0: L_off counts, and L_sfm needs the absolute value
     model.air = random(*model.air.shape, low=-0.2, high=0.2)
     model.sfm = random(*model.sfm.shape, low=-0.2, high=0.2)
     plain = plain_losses(model, rays, done)
     total, log = model.losses(rays, photos, done, generator())
-    log |= dict(cell_error=model.sdf.octree.cell_error, quantile=model.usual_errors.quantile)
+    log |= dict(cell_error=model.sdf.octree.cell_error)
     for name, value in log.items():
         assert_tensors_close(value, plain[name])
     weights = dict(rgb=1, reg=model.cfg.lam_mask)
@@ -2985,7 +2973,7 @@ def project(x, axes, K):
 
 
 def splat(center, cov, opacity, rgb, xy):
-    """Colour (B,P,C) of pixels xy (B,P,2) of tiles, and what passes all Gaussians (B,P), which come
+    """Colour (B,P,3) of pixels xy (B,P,2) of tiles, and what passes all Gaussians (B,P), which come
     front first: alpha = opacity exp(-1/2 d^T cov^-1 d), composited as samples of a ray are (Kerbl
     et al. 2023 Eq. 3). A tile's D Gaussians are those that reach its bounding box."""
     variance = cov.detach().diagonal(dim1=1, dim2=2)  # (N,2)
@@ -3000,9 +2988,9 @@ def splat(center, cov, opacity, rgb, xy):
 
     a, b, _, c = cov.flatten(1).unbind(1)
     inverse = torch.stack([c, -b, a], 1) / (a * c - b * b)[:, None]  # (N,3)
-    columns = torch.cat([center, inverse, opacity[:, None], rgb], 1)  # (N,6+C)
-    columns = F.embedding(index, columns)  # (B,D,6+C)
-    center, inverse, opacity, rgb = columns.split([2, 3, 1, rgb.shape[1]], 2)
+    columns = torch.cat([center, inverse, opacity[:, None], rgb], 1)  # (N,9)
+    columns = F.embedding(index, columns)  # (B,D,9)
+    center, inverse, opacity, rgb = columns.split([2, 3, 1, 3], 2)
     x, y = (xy[:, :, None] - center[:, None]).unbind(3)  # (B,P,D)
     a, b, c = inverse[:, None].unbind(3)  # (B,1,D)
     power = a * x * x + 2 * b * x * y + c * y * y  # (B,P,D)
@@ -3040,7 +3028,6 @@ class Splats(Rival):
         nn.init.normal_(self.appearance.weight, std=0.01)
         self.has_mask = cfg.mask == "on"
         self.mask = geonvs.TransientMask(scene.thumbs) if self.has_mask else None
-        self.usual_errors = geonvs.UsualErrors()
 
     def groups(self):
         rates = dict(
@@ -3074,13 +3061,12 @@ class Splats(Rival):
                 view = self.view(photo)
             mine = rays.photo == photo  # (R,)
             xy = rays.uv[mine, None] * self.scene.wh[photo]  # (R,1,2) px, each ray a tile
-            picture, _ = self.draw(view, code[mine][0], xy)
-            rgb[mine] = picture[:, 0]
+            rgb[mine] = self.draw(view, code[mine][0], xy)[:, 0]
         return rgb
 
     def view(self, photo):
         """Which Gaussians a photo sees, front first (N,); their centres (N,2) px and covariances
-        (N,2,2) px^2 in it; their distances (N,1) from the camera, without gradient."""
+        (N,2,2) px^2 in it."""
         K = self.scene.K[photo]
         c2w = self.scene.c2w[photo]
         turn = c2w[:, :3]
@@ -3093,38 +3079,30 @@ class Splats(Rival):
         order = order[is_seen[order]]
         axes = turn.T @ rotation(self.turn[order])
         axes = axes * self.log_size[order, None].exp()
-        x = x[order]
-        center, cov = project(x, axes, K)
-        return order, center, cov, x.detach().norm(dim=1, keepdim=True)
+        return order, *project(x[order], axes, K)
 
     def draw(self, view, code, xy):
-        """Colours (B,P,3) of pixels xy (B,P,2) of a view under a code (A,), and mean distance
-        (B,P,1) of what is seen."""
-        order, center, cov, distance = view
+        """Colours (B,P,3) of pixels xy (B,P,2) of a view under a code (A,)."""
+        order, center, cov = view
         feature = torch.cat([self.feature[order], self.feature[-1:]])  # (N+1,F)
         codes = code.expand(len(feature), -1)
         rgb = self.paint(torch.cat([feature, codes], 1))
         rgb = (feature[:, :3] + rgb).sigmoid()
         opacity = self.opacity[order].sigmoid()
-        columns = torch.cat([rgb[:-1], distance], 1)  # (N,4)
-        picture, trans = splat(center, cov, opacity, columns, xy)
-        trans = trans[..., None]
-        distance = picture[..., 3:] / (1 - trans).clamp_min(1e-3)
-        return picture[..., :3] + trans * rgb[-1], distance.detach()
+        picture, trans = splat(center, cov, opacity, rgb[:-1], xy)
+        return picture + trans[..., None] * rgb[-1]
 
     def losses(self, rays, photos, done, gen):
         """Mean absolute error of rays of one photo, weighted by what the mask leaves."""
         photo = photos.item()
         xy = rays.uv * self.scene.wh[photo]  # px
         tiles = xy.view(-1, TILE**2, 2)
-        rgb, distance = self.draw(self.view(photo), self.appearance.weight[photo], tiles)
+        rgb = self.draw(self.view(photo), self.appearance.weight[photo], tiles)
         rgb = rgb.flatten(0, 1)  # (R,3)
         residual = (rgb - rays.rgb).abs()
         error = residual.detach().amax(1)  # (R,) of the worst channel
-        place = geonvs.contract(rays.at(distance.flatten(0, 1))[:, 0])  # (R,3)
         no_edges = torch.zeros_like(error)  # Phi
-        left_out, reg, _ = self.transients(rays, photos, place, no_edges, error, done)
-        self.usual_errors.update(place, error, ~rays.is_masked)
+        left_out, reg, _ = self.transients(rays, photos, no_edges, error, done)
         loss = ((1 - left_out) * residual.mean(1)).mean()
         mse = residual.detach().square().mean()
         return loss + reg, dict(rgb=loss, reg=reg, mse=mse)
@@ -3210,7 +3188,6 @@ PARTS = {
     "no codes": Row(dict(appearance="off")),
     "no background": Row(dict(background="off")),
     "no normal as an input": Row(kind=NoNormal),
-    "no threshold by place": Row(constants=dict(PLACE_FACTOR=0.0)),
     "density": METHODS["density"]}
 GRID = {"octree": Row(), "uniform grid": Row(kind=UniformGrid)}
 STRESS = {  # knobs of a toy, and the row of PARTS without what is made for it
@@ -3543,7 +3520,7 @@ def test_a_projected_gaussian_has_the_spread_of_projected_samples():
 
 def test_a_view_shows_gaussians_where_the_rays_through_them_are(scene):
     model = rival(scene, "splats")
-    order, center, _, _ = model.view(1)
+    order, center, _ = model.view(1)
     depth = (model.center[order] - scene.c2w[1, :, 3]) @ scene.c2w[1, :, 2]
     assert (depth.diff() >= 0).all()  # front first
     is_inside = ((center >= 0) & (center < scene.wh[1])).all(1)  # (N,)
