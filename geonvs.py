@@ -45,7 +45,7 @@ Departures from the printed paper. The tag stands at the code; .github/RESULTS.m
   [D2]  E_curv = |lap s|; Phi on       |lap s| h, h being the step of    |lap s| grows as h shrinks;
         every ray                      the difference; L_eik, L_curv,    rays through air have no
                                        Phi are weighted by opacity       edges
-  [D3]  L_reg: penalties of            M is trained to classify rays     castle: 3.2 dB, four other
+  [D3]  L_reg: penalties of            M is trained to classify rays     castle: 2.8 dB, three other
         intensity and bimodality of    by error; M is fixed at 60 %      sets of photos: level
         M, which L_rgb trains, too     of training
   [D4]  CGNet                          a block a stage, GroupNorm, a     photos are small, a few in
@@ -182,9 +182,9 @@ GPU_DEFAULTS = dict(steps=75_000, rays=16_384, photos=16, samples=32, appearance
 
 @dataclass
 class Processes:
-    """The processes that torchrun started, or this one alone. Each draws its own rays. Gradients are
-    averaged, so all hold the same weights. Rank 0 decides, prints and saves. One process on a CPU
-    resumes bit for bit. A GPU adds floats in any order, and of several processes only the first
+    """The processes that torchrun started, or this one alone. Each draws its own rays. Gradients
+    are averaged, so all hold the same weights. Rank 0 decides, prints and saves. One process on a
+    CPU resumes bit for bit. A GPU adds floats in any order, and of several processes only the first
     keeps its random numbers."""
     count: int = 1
     rank: int = 0
@@ -1154,9 +1154,9 @@ class GeoNVS(nn.Module):
         return edge_indicator(complexity(e_grad, e_curv), hits.opacity.detach() * is_counted)
 
     def transients(self, rays, photos, phi, error, done):
-        """Section 6 for rays with Phi and errors (R,). Returns left_out (R,), L_reg and L_GPL. L_rgb
-        is weighted by 1 - left_out, which does not train M. left_out is M, or 1 where a user's mask
-        excludes the pixel."""
+        """Section 6 for rays with Phi and errors (R,). Returns left_out (R,), L_reg and L_GPL.
+        L_rgb is weighted by 1 - left_out, which does not train M. left_out is M, or 1 where a
+        user's mask excludes the pixel."""
         if not self.has_mask:
             return rays.is_masked.float(), *error.new_zeros(2)
         with torch.set_grad_enabled(done < MASK_TRAINING):
