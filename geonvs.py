@@ -45,8 +45,8 @@ Departures from the printed paper. The tag stands at the code; .github/RESULTS.m
   [D2]  E_curv = |lap s|; Phi on       |lap s| h, h being the step of    |lap s| grows as h shrinks;
         every ray                      the difference; L_eik, L_curv,    rays through air have no
                                        Phi are weighted by opacity       edges
-  [D3]  L_reg: penalties of            M is trained to classify rays     castle: 2.8 dB, three other
-        intensity and bimodality of    by error; M is fixed at 60 %      sets of photos: level
+  [D3]  L_reg: penalties of            M is trained to classify rays     castle: 2.8 dB; Reichstag,
+        intensity and bimodality of    by error; M is fixed at 60 %      crowd: level
         M, which L_rgb trains, too     of training
   [D4]  CGNet                          a block a stage, GroupNorm, a     photos are small, a few in
                                        head at each resolution           a batch
@@ -877,16 +877,16 @@ def paper_phi(ray_complexity):
 
 def gpl_loss(mask, phi):
     """L_GPL, Eq. 3: the mean of M(r) Phi(r); the mask must not erase edges of the structure. Phi
-    has no gradient: the loss moves the mask, never the SDF. At the paper's weight no effect was
-    measured here. [D6]"""
+    has no gradient: the loss moves the mask, never the SDF. At the paper's weight it has no effect
+    that counts here. [D6]"""
     return (mask * phi).mean()
 
 
 def mask_loss(logit, excess):
     """L_reg: binary cross entropy that classifies rays (R,). The label of a ray is 1 if its error
-    exceeds its threshold (excess > 0), else 0; its weight is |excess|. Without L_GPL the best M of
-    a ray is its label. The simpler loss (1 - M) error + M threshold has the same minimum, but no
-    gradient where the sigmoid saturates. With L_GPL an outlier minimises
+    exceeds THRESHOLD (excess > 0), else 0; its weight is |excess|. Without L_GPL the best M of a
+    ray is its label. The simpler loss (1 - M) error + M THRESHOLD has the same minimum, but no
+    gradient where the sigmoid saturates. With L_GPL a ray with excess > 0 minimises
     -excess log M + lam_gpl M Phi (lam_mask is 1). Its best M is excess / (lam_gpl Phi), at most 1:
     an edge with Phi = 1 is masked fully only if excess is at least lam_gpl. [D3]"""
     is_transient = (excess > 0).float()
